@@ -1,0 +1,43 @@
+"""Arrow arrays from and to NumPy through their buffers.
+
+``pa.array(ndarray)`` and ``Array.to_numpy()`` import pandas where it is installed, which costs more
+than reading a trace; these do not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+def from_numpy(values: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = None) -> Any:
+    """An Arrow array of one-dimensional numbers; null where ``valid`` is false."""
+    import pyarrow as pa
+
+    values = np.ascontiguousarray(values)
+    bitmap = None
+    if valid is not None and not valid.all():
+        bitmap = pa.py_buffer(np.packbits(valid, bitorder="little").tobytes())
+    arrow_type = pa.from_numpy_dtype(values.dtype)
+    return pa.Array.from_buffers(arrow_type, len(values), [bitmap, pa.py_buffer(values)])
+
+
+def to_numpy(array: Any, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """The values of a primitive Arrow array; what stands where it is null is arbitrary."""
+    data = array.buffers()[1]
+    if data is None:
+        return np.zeros(len(array), dtype)
+    return np.frombuffer(data, dtype, len(array), array.offset * np.dtype(dtype).itemsize)
+
+
+def is_null(array: Any) -> npt.NDArray[np.bool_]:
+    """Where an Arrow array is null, bool [n]."""
+    bitmap = array.buffers()[0]
+    if bitmap is None or not array.null_count:
+        return np.zeros(len(array), np.bool_)
+    end = array.offset + len(array)
+    bits = np.unpackbits(np.frombuffer(bitmap, np.uint8), count=end, bitorder="little")
+    null: npt.NDArray[np.bool_] = bits[array.offset :] == 0
+    return null

@@ -1,0 +1,31 @@
+"""Geometry of boxes: ``x, y, w, h`` in pixels, top-left origin."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+
+def iou(a: Floats, b: Floats) -> Floats:
+    """Intersection over union, row by row.
+
+    Args:
+        a, b: boxes, float64 [n, 4].
+
+    Returns:
+        float64 [n] in 0..1; 0 where the union is empty or a box is NaN.
+    """
+    right_bottom = np.minimum(a[:, :2] + a[:, 2:], b[:, :2] + b[:, 2:])
+    overlap = np.maximum(right_bottom - np.maximum(a[:, :2], b[:, :2]), 0.0)
+    intersection = overlap[:, 0] * overlap[:, 1]
+    union = a[:, 2] * a[:, 3] + b[:, 2] * b[:, 3] - intersection
+    ratio = np.zeros(len(union))
+    np.divide(intersection, union, out=ratio, where=union > 0)
+    return np.clip(ratio, 0.0, 1.0)
+
+
+def centre(boxes: Floats) -> Floats:
+    """Centre pixel ``(x + (w-1)/2, y + (h-1)/2)`` as the pysot toolkit has it, float64 [n, 2]."""
+    return boxes[:, :2] + (boxes[:, 2:] - 1.0) / 2.0

@@ -1,0 +1,88 @@
+"""Exact time: rational frame rates, integer nanoseconds, integer ticks.
+
+No float decides an event. With a world rate of p/q frames per second, one tick is 1/p ns: frame
+``i`` arrives at exactly ``i * q * 10**9`` ticks, and ``n`` ns are ``n * p`` ticks.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+
+from lae_sim.errors import LaeError
+
+NS_PER_SECOND = 10**9
+MAX_TICKS = 2**63 - 1
+
+_DECIMAL = r"\d{1,12}(?:\.\d{1,12})?"
+_RATIONAL = re.compile(rf"(?:{_DECIMAL}|\d{{1,12}}/\d{{1,12}})\Z")
+_DURATION = re.compile(rf"({_DECIMAL})(ns|us|ms|s)\Z")
+_UNIT_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": NS_PER_SECOND}
+
+
+def parse_rational(text: str) -> Fraction:
+    """Read an exact number such as ``"30"``, ``"29.97"``, ``"30000/1001"`` or ``"-1/2"``.
+
+    Raises:
+        LaeError: if the text is not a plain decimal or fraction.
+    """
+    digits = text[1:] if text.startswith("-") else text
+    if not _RATIONAL.match(digits) or re.search(r"/0+\Z", digits):
+        raise LaeError(f"{text[:40]!r} is not an exact number: write 30, 29.97 or 30000/1001")
+    return Fraction(text)
+
+
+def parse_fps(text: str) -> Fraction:
+    """Read a frame rate in frames per second.
+
+    Raises:
+        LaeError: if it is not an exact number above zero.
+    """
+    fps = parse_rational(text)
+    if fps <= 0:
+        raise LaeError(f"a frame rate must be above zero, not {text!r}")
+    return fps
+
+
+def parse_duration(text: str) -> int:
+    """Read a duration with its unit (``"47ms"``, ``"0.1s"``) as integer nanoseconds.
+
+    Raises:
+        LaeError: if the unit is missing, or the duration is not a whole number of nanoseconds.
+    """
+    match = _DURATION.match(text)
+    if match is None:
+        raise LaeError(f"{text[:40]!r} is not a duration: write it with its unit, such as 47ms")
+    duration = Fraction(match[1]) * _UNIT_NS[match[2]]
+    if duration.denominator != 1:
+        raise LaeError(f"{text!r} is not a whole number of nanoseconds")
+    return int(duration)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The tick clock of one world frame rate.
+
+    Attributes:
+        ticks_per_ns: p, the numerator of the frame rate p/q.
+        frame_ticks: ticks between two frames, ``q * 10**9``.
+    """
+
+    ticks_per_ns: int
+    frame_ticks: int
+
+    @classmethod
+    def at(cls, fps: Fraction) -> Clock:
+        """The clock of a world that delivers ``fps`` frames per second."""
+        return cls(fps.numerator, fps.denominator * NS_PER_SECOND)
+
+    @property
+    def fps(self) -> Fraction:
+        """World frames per second."""
+        return Fraction(self.ticks_per_ns * NS_PER_SECOND, self.frame_ticks)
+
+    @property
+    def frame_ms(self) -> float:
+        """Milliseconds between two frames, for display."""
+        return self.frame_ticks / self.ticks_per_ns / 1e6

@@ -1,0 +1,219 @@
+"""Forecasters: where the target is now, from outputs that are already old.
+
+A forecaster is made for one sequence from its initial box, is fed the outputs in order, and
+predicts the box at any later frame. Anything with these two methods will do:
+
+    class MyForecaster:
+        def __init__(self, box, image_size=None): ...
+        def update(self, frame, box): ...
+        def predict(self, frame): return [x, y, w, h]
+
+The class itself is the factory; name it ``package.module:MyForecaster`` on the command line.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Optional, Protocol, runtime_checkable
+
+import numpy as np
+
+from lae_sim.boxes import Floats
+from lae_sim.engine import Ints
+from lae_sim.errors import LaeError
+
+ImageSize = Optional[tuple[int, int]]
+"""Width and height of the images in pixels, or None if unknown."""
+
+
+class Forecaster(Protocol):
+    """One target's motion, from the outputs so far; boxes are ``x, y, w, h`` in pixels."""
+
+    def update(self, frame: int, box: Sequence[float]) -> None:
+        """Take in the box of a newer frame."""
+
+    def predict(self, frame: int) -> Sequence[float]:
+        """The box at a frame, from the boxes so far; may be asked many times, in any order."""
+
+
+ForecasterFactory = Callable[[Sequence[float], ImageSize], Forecaster]
+"""``factory(initial_box, image_size)`` makes the forecaster of one sequence."""
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """The outputs that forecasters are fed, lane after lane; a lane is one forecaster's life.
+
+    Attributes:
+        offsets: first item of each lane, and N: int64 [lanes + 1]. A lane's first item is the
+            initial box at frame 0.
+        frames: frame of each item, int64 [N].
+        boxes: box of each item, float64 [N, 4].
+        image_sizes: per lane, float64 [lanes, 2], infinite = unknown.
+    """
+
+    offsets: Ints
+    frames: Ints
+    boxes: Floats
+    image_sizes: Floats
+
+
+@dataclass(frozen=True)
+class Motion:
+    """State after each item of the lanes, extrapolated linearly: float64 [N, 4] each.
+
+    Attributes:
+        position: box at the item's frame, pixels.
+        velocity: change of the box, pixels per frame.
+    """
+
+    position: Floats
+    velocity: Floats
+
+
+@runtime_checkable
+class LaneFactory(Protocol):
+    """A factory that can also run many lanes at once, for forecasts linear in time."""
+
+    def run_lanes(self, lanes: Lanes) -> Motion:
+        """State after each item of every lane."""
+
+
+class Hold:
+    """No forecast: the latest box stands. The baseline of every comparison."""
+
+    memoryless = True  # looks at the latest output alone, so one history serves every sigma
+
+    def __init__(self, box: Sequence[float], image_size: ImageSize = None) -> None:
+        self._box = box
+
+    def update(self, frame: int, box: Sequence[float]) -> None:
+        """Take in the box of a newer frame."""
+        self._box = box
+
+    def predict(self, frame: int) -> Sequence[float]:
+        """The latest box."""
+        return self._box
+
+    @staticmethod
+    def run_lanes(lanes: Lanes) -> Motion:
+        """The same for many lanes at once."""
+        return Motion(lanes.boxes, np.zeros_like(lanes.boxes))
+
+
+class ConstantVelocity:
+    """The latest box moved on by the difference of the last two."""
+
+    def __init__(self, box: Sequence[float], image_size: ImageSize = None) -> None:
+        self._frame = 0
+        self._box = [float(value) for value in box]
+        self._velocity = [0.0] * 4
+
+    def update(self, frame: int, box: Sequence[float]) -> None:
+        """Take in the box of a newer frame."""
+        interval = float(frame - self._frame)
+        self._velocity = [(new - old) / interval for new, old in zip(box, self._box)]
+        self._frame, self._box = frame, [float(value) for value in box]
+
+    def predict(self, frame: int) -> Sequence[float]:
+        """The box at a frame, from the last two boxes."""
+        interval = float(frame - self._frame)
+        return [p + interval * v for p, v in zip(self._box, self._velocity)]
+
+    @staticmethod
+    def run_lanes(lanes: Lanes) -> Motion:
+        """The same for many lanes at once; equal bit for bit."""
+        velocity = np.zeros_like(lanes.boxes)
+        interval = np.diff(lanes.frames).astype(np.float64)
+        interval[lanes.offsets[1:-1] - 1] = np.inf  # between two lanes
+        velocity[1:] = np.diff(lanes.boxes, axis=0) / interval[:, None]
+        velocity[lanes.offsets[:-1]] = 0.0
+        return Motion(lanes.boxes, velocity)
+
+
+def load_forecaster(name: str) -> ForecasterFactory:
+    """A forecaster by its name, or a user's own as ``package.module:factory``.
+
+    Modules are also looked for in the current folder.
+
+    Raises:
+        LaeError: if there is none of that name, or it cannot be imported.
+    """
+    from lae_sim.kalman import Kalman, KalmanLaePvt
+
+    built_in: dict[str, ForecasterFactory] = {
+        "hold": Hold,
+        "constant-velocity": ConstantVelocity,
+        "kalman": Kalman,
+        "kalman-lae-pvt": KalmanLaePvt,
+    }
+    if name in built_in:
+        return built_in[name]
+    module_name, colon, attribute = name.partition(":")
+    if not colon:
+        raise LaeError(
+            f"no forecaster {name!r}: there are {', '.join(built_in)}, and package.module:factory"
+        )
+    here = str(Path.cwd())
+    sys.path.insert(0, here)
+    try:
+        factory: Any = importlib.import_module(module_name)
+        for part in attribute.split("."):
+            factory = getattr(factory, part)
+    except Exception as error:  # a user's module may fail in any way while it is imported
+        raise LaeError(f"forecaster {name!r}: {type(error).__name__}: {error}") from error
+    finally:
+        sys.path.remove(here)
+    if not callable(factory):
+        raise LaeError(f"forecaster {name!r} is not callable")
+    return factory  # type: ignore[no-any-return]
+
+
+def forecast(
+    factory: ForecasterFactory, lanes: Lanes, item: Ints, frame: Ints, name: str = "forecaster"
+) -> Floats:
+    """Forecasts of each lane's forecaster, each as of one of the lane's items.
+
+    Args:
+        factory: makes the forecasters.
+        lanes: what they are fed.
+        item: index of the latest item that a forecast has seen, int64 [P], not decreasing.
+        frame: the frame it is for, int64 [P].
+        name: the forecaster's name, for messages.
+
+    Returns:
+        Boxes, float64 [P, 4].
+
+    Raises:
+        LaeError: if a forecaster answers anything but four finite numbers.
+    """
+    lane = np.searchsorted(lanes.offsets, item, "right") - 1
+    if isinstance(factory, LaneFactory):
+        motion = factory.run_lanes(lanes)
+        interval = (frame - lanes.frames[item]).astype(np.float64)
+        boxes: Floats = motion.position[item] + interval[:, None] * motion.velocity[item]
+        finish = getattr(factory, "finish", None)
+        return (
+            boxes if finish is None else finish(boxes, lanes.boxes[item], lanes.image_sizes[lane])
+        )
+    answers = np.empty((len(item), 4))
+    fed, current = -1, -1
+    forecaster: Any = None
+    for p, (i, k) in enumerate(zip(item.tolist(), lane.tolist())):
+        if k != current:
+            current, fed = k, int(lanes.offsets[k])
+            size = lanes.image_sizes[k]
+            known = (int(size[0]), int(size[1])) if np.isfinite(size).all() else None
+            forecaster = factory(lanes.boxes[fed].tolist(), known)
+        while fed < i:
+            fed += 1
+            forecaster.update(int(lanes.frames[fed]), lanes.boxes[fed].tolist())
+        answer = np.asarray(forecaster.predict(int(frame[p])), np.float64)
+        if answer.shape != (4,) or not np.isfinite(answer).all():
+            raise LaeError(f"{name}: predicted {answer} for frame {frame[p]}, not a box x, y, w, h")
+        answers[p] = answer
+    return answers

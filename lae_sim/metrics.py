@@ -1,0 +1,187 @@
+"""Success and precision under the conventions of the toolkits in use.
+
+Success (Wu et al., OTB 2013): the share of frames with IoU > t; its AUC is the mean over thresholds
+t. Precision: the share of frames whose centre error is <= t pixels; DP is at 20. Normalised
+precision (Mueller et al., TrackingNet 2018): the error over the truth's width and height, at 0.20,
+and the mean over 0, 0.01, ..., 0.50. With strict IoU > t and t up to 1, a perfect tracker's AUC is
+20/21. Toolkits disagree on frames without a valid truth, by up to 30 points on the same boxes, so
+each convention has a name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim.boxes import Floats, centre, iou
+from lae_sim.engine import Ints
+from lae_sim.errors import LaeError
+
+Bools = npt.NDArray[np.bool_]
+
+CENTRE_THRESHOLDS = np.arange(51, dtype=np.float64)
+NORM_THRESHOLDS = np.arange(51) / 100
+DP_PIXELS = 20.0
+NORM_DP = 0.20
+
+
+@dataclass(frozen=True)
+class Convention:
+    """How a toolkit counts frames and thresholds.
+
+    Attributes:
+        name: its name here.
+        valid: the truth counts for success if ``"size"`` (w > 0 and h > 0), ``"positive"`` (all of
+            x, y, w, h > 0) or ``"finite"`` (no NaN).
+        leaves_out: frames without a valid truth leave both metrics. Otherwise they are misses of
+            success, and *hits* of precision where the truth's centre is not > 0 in x and y.
+        thresholds: number of IoU thresholds, evenly spaced from 0 to 1.
+        first_frame_is_truth: the answer for frame 0 is replaced by the truth.
+        drops_zeros: sequences whose curve is 0 everywhere leave the mean over sequences.
+    """
+
+    name: str
+    valid: str
+    leaves_out: bool = False
+    thresholds: int = 21
+    first_frame_is_truth: bool = False
+    drops_zeros: bool = False
+
+    @property
+    def iou_thresholds(self) -> Floats:
+        """IoU thresholds, float64, ascending."""
+        steps = self.thresholds - 1
+        return np.arange(self.thresholds) / steps
+
+    def valid_success(self, truth: Floats) -> Bools:
+        """Where the truth counts for success, bool [n]."""
+        if self.valid == "size":
+            return np.all(truth[:, 2:] > 0, axis=1)
+        if self.valid == "positive":
+            return np.all(truth > 0, axis=1)
+        return ~np.any(np.isnan(truth), axis=1)
+
+    def valid_precision(self, truth: Floats) -> Bools:
+        """Where the truth counts for precision, bool [n]."""
+        if self.leaves_out:
+            return self.valid_success(truth)
+        return np.all(centre(truth) > 0, axis=1)
+
+
+CONVENTIONS = {
+    convention.name: convention
+    for convention in (
+        Convention("pysot", "size"),
+        Convention("elae", "positive"),
+        Convention("otb", "positive", first_frame_is_truth=True, drops_zeros=True),
+        Convention("got10k", "finite", leaves_out=True),
+        Convention("got10k-101", "finite", leaves_out=True, thresholds=101),
+        Convention("exclude", "size", leaves_out=True),
+    )
+}
+
+
+PYSOT = CONVENTIONS["pysot"]
+"""The default: LAE-PVT and PVT++ use it."""
+
+
+def find_convention(name: str) -> Convention:
+    """A convention by name.
+
+    Raises:
+        LaeError: if there is none of that name.
+    """
+    if name not in CONVENTIONS:
+        raise LaeError(f"no convention {name!r}: there are {', '.join(CONVENTIONS)}")
+    return CONVENTIONS[name]
+
+
+METRICS = ("auc", "dp20", "norm_dp20", "norm_auc")
+"""What :func:`frame_counts` counts, in order, before ``within50``: see :class:`FrameCounts`."""
+
+
+@dataclass(frozen=True)
+class FrameCounts:
+    """What each answered frame adds to each metric's sum, before dividing.
+
+    Attributes:
+        success: IoU thresholds passed, int64 [n].
+        dp: 1 if the centre error is <= 20 px, int64 [n].
+        norm_dp: 1 if the normalised error is <= 0.20, int64 [n].
+        norm: normalised thresholds passed, int64 [n].
+        within50: 1 if the centre error is <= 50 px, int64 [n].
+    """
+
+    success: Ints
+    dp: Ints
+    norm_dp: Ints
+    norm: Ints
+    within50: Ints
+
+
+def frame_counts(
+    truth: Floats, answers: Floats, frames: Ints, convention: Convention
+) -> FrameCounts:
+    """Count what each answer is worth.
+
+    Args:
+        truth, answers: boxes, float64 [n, 4]; a NaN truth is none.
+        frames: the world frame of each, int64 [n].
+        convention: which frames count.
+    """
+    if convention.first_frame_is_truth:
+        answers = np.where((frames == 0)[:, None], truth, answers)
+    valid = convention.valid_success(truth)
+    overlap = np.where(valid, iou(truth, answers), -1.0)
+    success = np.searchsorted(convention.iou_thresholds, overlap)  # thresholds t < IoU
+
+    offset = centre(answers) - centre(truth)
+    valid_centre = convention.valid_precision(truth)
+    invalid_error = np.inf if convention.leaves_out else -1.0
+    error = np.where(valid_centre, _length(offset), invalid_error)
+    sized = np.where(truth[:, 2:] > 0, truth[:, 2:], np.nan)
+    norm_error = np.where(valid_centre, _length(offset / sized), invalid_error)
+    norm_error = np.where(np.isnan(norm_error), np.inf, norm_error)
+    return FrameCounts(
+        success=success,
+        dp=(error <= DP_PIXELS).astype(np.int64),
+        norm_dp=(norm_error <= NORM_DP).astype(np.int64),
+        norm=len(NORM_THRESHOLDS) - np.searchsorted(NORM_THRESHOLDS, norm_error),
+        within50=(error <= CENTRE_THRESHOLDS[-1]).astype(np.int64),
+    )
+
+
+def _length(vectors: Floats) -> Floats:
+    length: Floats = np.sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2)
+    return length
+
+
+def success_curve(truth: Floats, answers: Floats, convention: Convention) -> Floats:
+    """Success over the convention's IoU thresholds for one sequence, float64 [thresholds].
+
+    Args:
+        truth, answers: boxes of every world frame, float64 [T, 4].
+    """
+    counts = frame_counts(truth, answers, np.arange(len(truth)), convention)
+    scored = convention.valid_success(truth) if convention.leaves_out else np.ones(len(truth), bool)
+    passed = counts.success[scored, None] > np.arange(convention.thresholds)
+    curve: Floats = passed.mean(axis=0)
+    return curve
+
+
+def precision_curve(truth: Floats, answers: Floats, convention: Convention) -> Floats:
+    """Precision over 0, 1, ..., 50 px for one sequence, float64 [51].
+
+    Args:
+        truth, answers: boxes of every world frame, float64 [T, 4].
+    """
+    if convention.first_frame_is_truth:
+        answers = np.concatenate([truth[:1], answers[1:]])
+    valid = convention.valid_precision(truth)
+    error = np.where(valid, _length(centre(answers) - centre(truth)), -1.0)
+    if convention.leaves_out:
+        error = error[valid]
+    curve: Floats = (error[:, None] <= CENTRE_THRESHOLDS).mean(axis=0)
+    return curve

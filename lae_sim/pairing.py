@@ -1,0 +1,213 @@
+"""Pairing: which output answers each query, for any set of permitted latencies at once.
+
+The query for world frame i happens at (i + sigma) / fps; its answer is the latest output that is
+ready by then, equality counts (PVT 2021, Eq. 5; sigma is from PVT++ 2023). With every sigma a
+multiple of 1/b frames, an output ready at tick t is visible at query (i, m/b) iff K <= b*i + m,
+where K = ceil(b*t / frame_ticks) is its *step*: all is integer from there on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import lcm
+
+import numpy as np
+
+from lae_sim.engine import Ints, Schedule
+from lae_sim.errors import LaeError
+
+SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
+"""The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames."""
+
+_NEVER = 2**62
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Who answers whom in some sequences, for some permitted latencies.
+
+    The n outputs of all sequences stand one after another; M is the number of sigmas.
+
+    Attributes:
+        lengths: world frames of each sequence, int64 [S].
+        offsets: first output of each sequence, and n: int64 [S + 1].
+        frames: source frame of each output, int64 [n].
+        steps: step from which each output is visible, int64 [n]; hugely negative for the first
+            of a sequence, since the initial box is always there.
+        next_steps: step of the output after it, int64 [n]; huge for the last of a sequence.
+        scale: b, steps per frame.
+        sigmas: m for each permitted latency m/b, ascending, int64 [M].
+        first: first world frame that each output answers, int64 [n, M].
+        end: the frame after the last one it answers, int64 [n, M]; equal to ``first`` if it
+            answers none.
+    """
+
+    lengths: Ints
+    offsets: Ints
+    frames: Ints
+    steps: Ints
+    next_steps: Ints
+    scale: int
+    sigmas: Ints
+    first: Ints
+    end: Ints
+
+    def per_sequence_sum(self, values: Ints) -> Ints:
+        """Sum of [n, M] values over the outputs of each sequence, [S, M]."""
+        total: Ints = np.add.reduceat(values, self.offsets[:-1], axis=0)
+        return total
+
+    def per_sequence_max(self, values: Ints) -> Ints:
+        """Maximum of [n, M] values over the outputs of each sequence, [S, M]."""
+        largest: Ints = np.maximum.reduceat(values, self.offsets[:-1], axis=0)
+        return largest
+
+    @property
+    def mismatch_sum(self) -> Ints:
+        """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""
+        mean_twice = self.first + self.end - 1 - 2 * self.frames[:, None]
+        return self.per_sequence_sum((self.end - self.first) * mean_twice // 2)
+
+    @property
+    def mismatch_max(self) -> Ints:
+        """Largest i - psi(i) of each sequence, frames, int64 [S, M]."""
+        used = self.end > self.first
+        oldest = np.where(used, self.end - 1 - self.frames[:, None], np.iinfo(np.int64).min)
+        return self.per_sequence_max(oldest)
+
+    @property
+    def longest_hold(self) -> Ints:
+        """Most queries in a row that one output answered, frames, int64 [S, M]."""
+        return self.per_sequence_max(self.end - self.first)
+
+
+def pair(
+    schedules: Sequence[Schedule], sigmas: Sequence[Fraction], at_arrival: bool = False
+) -> Pairing:
+    """Pair the outputs of some sequences with their queries.
+
+    Args:
+        schedules: one per sequence, all of one clock.
+        sigmas: distinct permitted latencies in frames, ascending.
+        at_arrival: let each output count from its own frame's arrival, as the VOT toolkit scores;
+            latency then plays no part.
+
+    Raises:
+        LaeError: if a sigma is too fine or too large for 64-bit integers.
+    """
+    scale = lcm(*(sigma.denominator for sigma in sigmas))
+    numerators = [int(sigma * scale) for sigma in sigmas]
+    interval = schedules[0].clock.frame_ticks
+    lengths = np.array([schedule.length for schedule in schedules], np.int64)
+    last_ready = max(int(schedule.ready[-1]) for schedule in schedules)
+    largest = max(last_ready // interval, int(lengths.max())) * scale
+    if max(scale * interval, largest + max(map(abs, numerators))) >= _NEVER:
+        raise LaeError(
+            f"the permitted latencies {', '.join(map(str, sigmas[:3]))}... are too fine for exact "
+            "64-bit arithmetic: use fewer digits"
+        )
+    counts = [len(schedule.frames) for schedule in schedules]
+    offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    frames = np.concatenate([schedule.frames for schedule in schedules])
+    if at_arrival:
+        steps = frames * scale
+    else:
+        frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]), interval)
+        steps = frame * scale - (-rest * scale // interval)
+    steps[offsets[:-1]] = -_NEVER
+    next_steps = np.append(steps[1:], _NEVER)
+    next_steps[offsets[1:] - 1] = _NEVER
+    m = np.array(numerators, np.int64)
+    limit = np.repeat(lengths, counts)[:, None]
+    first = np.clip(-((m - steps[:, None]) // scale), 0, limit)
+    end = np.empty_like(first)
+    end[:-1] = first[1:]
+    end[offsets[1:] - 1] = lengths[:, None]
+    return Pairing(lengths, offsets, frames, steps, next_steps, scale, m, first, end)
+
+
+@dataclass(frozen=True)
+class Histories:
+    """What forecasters were fed: the outputs answered with, where sigmas that agree share.
+
+    Attributes:
+        sequence: the sequence of each history, int64 [L].
+        sigma_from, sigma_to: the range of sigmas that share it, int64 [L].
+        offsets: first item of each history, and N: int64 [L + 1].
+        output: the output of each item, int64 [N]; the first of a history is the initial box.
+    """
+
+    sequence: Ints
+    sigma_from: Ints
+    sigma_to: Ints
+    offsets: Ints
+    output: Ints
+
+
+def histories(pairing: Pairing, memoryless: bool = False) -> Histories:
+    """The outputs that a forecaster is fed in each sequence, per sigma.
+
+    An output overtaken between two queries is never used. With ``memoryless``, for forecasters that
+    look at the latest output alone, one history of all outputs serves every sigma.
+    """
+    count = len(pairing.sigmas)
+    used = pairing.end > pairing.first
+    used[pairing.offsets[:-1]] = True  # every forecaster starts from the initial box
+    begins = np.zeros((len(pairing.lengths), count), np.bool_)
+    begins[:, 0] = True
+    if memoryless:
+        used[:] = True
+    elif count > 1:
+        begins[:, 1:] = np.logical_or.reduceat(used[:, 1:] != used[:, :-1], pairing.offsets[:-1])
+    sequence, sigma_from = np.nonzero(begins)
+    sigma_to = np.append(sigma_from[1:], 0)
+    sigma_to[sigma_to == 0] = count
+    sizes = np.diff(pairing.offsets)[sequence]
+    output = ranges(pairing.offsets[sequence], sizes)
+    history = np.repeat(np.arange(len(sequence)), sizes)
+    kept = used[output, sigma_from[history]]
+    items = np.bincount(history[kept], minlength=len(sequence))
+    offsets = np.concatenate([[0], np.cumsum(items)])
+    return Histories(sequence, sigma_from, sigma_to, offsets, output[kept])
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Each (world frame, history item) that some sigma pairs, once.
+
+    Attributes:
+        item: index into the histories' items, int64 [P], not decreasing.
+        frame: world frame i, int64 [P].
+        sigma_from, sigma_to: the range of sigmas that pair them, int64 [P].
+    """
+
+    item: Ints
+    frame: Ints
+    sigma_from: Ints
+    sigma_to: Ints
+
+
+def pairs(pairing: Pairing, fed: Histories) -> Pairs:
+    """List the distinct pairs of frames and outputs, with the sigmas each is for."""
+    history = np.repeat(np.arange(len(fed.sequence)), np.diff(fed.offsets))
+    low, high = fed.sigma_from[history], fed.sigma_to[history]
+    begin = pairing.first[fed.output, high - 1]
+    sizes = np.maximum(pairing.end[fed.output, low] - begin, 0)
+    item = np.repeat(np.arange(len(history)), sizes)
+    frame = ranges(begin, sizes)
+    output = fed.output[item]
+    query = pairing.scale * frame
+    visible = np.searchsorted(pairing.sigmas, pairing.steps[output] - query)
+    hidden = np.searchsorted(pairing.sigmas, pairing.next_steps[output] - query)
+    sigma_from, sigma_to = np.maximum(visible, low[item]), np.minimum(hidden, high[item])
+    some = sigma_from < sigma_to
+    return Pairs(item[some], frame[some], sigma_from[some], sigma_to[some])
+
+
+def ranges(starts: Ints, sizes: Ints) -> Ints:
+    """``sizes[0]`` integers from ``starts[0]`` on, then ``sizes[1]`` from ``starts[1]``, ..."""
+    ends = np.cumsum(sizes)
+    joined: Ints = np.arange(ends[-1] if len(ends) else 0) + np.repeat(starts - ends + sizes, sizes)
+    return joined

@@ -1,0 +1,97 @@
+"""Scheduling policies: which frame a free tracker processes next.
+
+Each is a plain function of the clock and the calls so far (see :data:`lae_sim.engine.Policy`), or
+makes one. ``calls[-1].ready`` is *now*, ``calls[-1].frame`` the last frame processed, and
+``now // clock.frame_ticks`` the newest frame that has arrived (equality counts).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lae_sim.clock import Clock
+from lae_sim.engine import Call, Policy
+
+
+def _start(clock: Clock, now: int, frame: int) -> tuple[int, int]:
+    """Start ``frame`` now, or at its arrival if that is still to come."""
+    arrival = frame * clock.frame_ticks
+    return frame, now if now > arrival else arrival
+
+
+def latest(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+    """The newest frame that has arrived, or the next to arrive (PVT 2021, Eqs. 3-4)."""
+    last, _, now = calls[-1]
+    newest = now // clock.frame_ticks
+    return _start(clock, now, newest if newest > last else last + 1)
+
+
+def fifo(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+    """Every frame in order; frames queue while the tracker is busy."""
+    last, _, now = calls[-1]
+    return _start(clock, now, last + 1)
+
+
+def every(n: int) -> Policy:
+    """Every ``n``-th frame in order, a fixed stride; they queue if the tracker is slower."""
+
+    def fixed_stride(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        last, _, now = calls[-1]
+        return _start(clock, now, last + n)
+
+    return fixed_stride
+
+
+def shrinking_tail(expected_ns: int) -> Policy:
+    """The newest frame, or the next one if waiting for it lowers the expected tail.
+
+    Li, Wang and Ramanan, "Towards Streaming Perception" (2020), Alg. 1: with the tail
+    tau(t) = t - floor(t) in frames, a tracker that becomes free at s and needs r > 1 frames waits
+    iff tau(s + r) < tau(s). A tracker that needs at most one frame interval never waits.
+
+    Args:
+        expected_ns: the expected processing time r, ns.
+    """
+
+    def wait_if_the_tail_shrinks(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        last, _, now = calls[-1]
+        interval = clock.frame_ticks
+        newest = now // interval
+        expected = expected_ns * clock.ticks_per_ns
+        waits = expected > interval and (now + expected) % interval < now % interval
+        return _start(clock, now, newest + 1 if waits else max(newest, last + 1))
+
+    return wait_if_the_tail_shrinks
+
+
+def vot_realtime(grace: int = 3) -> Policy:
+    """The real-time rule of the VOT toolkit, which skips frames but never scores latency.
+
+    Every call starts at its frame's arrival, as if the tracker were free. A call that takes longer
+    than the frame interval owes its overtime: while more than one interval is owed, a frame is
+    skipped and one interval repaid; what is left is forgiven. The first ``grace`` calls over time
+    owe nothing (VOT 2022: 3). The toolkit scores each output at its own frame, so evaluate such a
+    schedule with ``at_arrival=True``.
+    """
+
+    def repay_whole_frames(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        interval = clock.frame_ticks
+        last, start, ready = calls[-1]
+        overtime = ready - start - interval
+        skipped = 0
+        if overtime > interval and _late_calls(calls, interval, grace + 1) > grace:
+            skipped = -(-overtime // interval) - 1
+        following = last + 1 + skipped
+        return following, following * interval
+
+    return repay_whole_frames
+
+
+def _late_calls(calls: Sequence[Call], interval: int, most: int) -> int:
+    """How many calls took longer than a frame interval, counted up to ``most``."""
+    late = 0
+    for call in calls:
+        late += call.ready - call.start > interval
+        if late == most:
+            break
+    return late

@@ -1,0 +1,78 @@
+"""One sequence of a trace in memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim.boxes import Floats
+from lae_sim.engine import Ints, Schedule
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One sequence of a trace, by world frame.
+
+    Attributes:
+        name: the sequence's name.
+        truth: ground truth boxes ``x, y, w, h`` in pixels, float64 [T, 4]; NaN = none.
+        boxes: the tracker's boxes, float64 [T, 4]; NaN = frame not processed.
+        elapsed_ns: processing times in ns, int64 [T]; -1 = frame not processed.
+        score: the tracker's confidence, float32 [T]; NaN = none.
+    """
+
+    name: str
+    truth: Floats
+    boxes: Floats
+    elapsed_ns: Ints
+    score: npt.NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """Number of world frames T."""
+        return len(self.elapsed_ns)
+
+    @classmethod
+    def new(
+        cls,
+        name: str,
+        truth: npt.ArrayLike,
+        boxes: npt.ArrayLike,
+        elapsed_ns: npt.ArrayLike,
+        score: npt.ArrayLike | None = None,
+    ) -> Recording:
+        """A recording from anything array-like; ``score`` defaults to none.
+
+        Raises:
+            ValueError: if the lengths differ.
+        """
+        times = np.asarray(elapsed_ns, np.int64)
+        no_score = np.full(len(times), np.nan, np.float32)
+        recording = cls(
+            name,
+            np.asarray(truth, np.float64).reshape(-1, 4),
+            np.asarray(boxes, np.float64).reshape(-1, 4),
+            times,
+            no_score if score is None else np.asarray(score, np.float32),
+        )
+        lengths = {len(recording.truth), len(recording.boxes), len(times), len(recording.score)}
+        if len(lengths) != 1:
+            raise ValueError(f"{name}: truth, boxes, times and scores differ in length: {lengths}")
+        return recording
+
+    @classmethod
+    def of_run(cls, name: str, schedule: Schedule, boxes: Floats, truth: Floats) -> Recording:
+        """The real-time recording of a schedule.
+
+        Args:
+            name: the sequence's name.
+            schedule: what the engine returned.
+            boxes: the box of each processed frame, float64 [n, 4].
+            truth: ground truth of every world frame, float64 [T, 4].
+        """
+        all_boxes = np.full((schedule.length, 4), np.nan)
+        elapsed = np.full(schedule.length, -1, np.int64)
+        all_boxes[schedule.frames] = boxes
+        elapsed[schedule.frames] = schedule.elapsed_ns
+        return cls.new(name, truth, all_boxes, elapsed)

@@ -1,0 +1,132 @@
+"""The rows of a trace as flat columns: between Parquet and recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim.arrow import from_numpy, is_null, to_numpy
+from lae_sim.boxes import Floats
+from lae_sim.engine import Ints
+from lae_sim.recording import Recording
+
+Bools = npt.NDArray[np.bool_]
+
+TRUTH = ("truth_x", "truth_y", "truth_w", "truth_h")
+BOX = ("x", "y", "w", "h")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Consecutive rows of a trace, n of them, of which each run of equal names is a sequence.
+
+    Attributes:
+        names: the name of each run.
+        starts: first row of each run, and n: int64 [runs + 1].
+        frame: int64 [n].
+        truth, boxes: float64 [n, 4], NaN where null.
+        truth_null, box_null: bool [n, 4].
+        elapsed_ns: int64 [n], -1 where null.
+        elapsed_null: bool [n].
+        score: float32 [n], NaN where null.
+    """
+
+    names: list[str]
+    starts: Ints
+    frame: Ints
+    truth: Floats
+    truth_null: Bools
+    boxes: Floats
+    box_null: Bools
+    elapsed_ns: Ints
+    elapsed_null: Bools
+    score: npt.NDArray[np.float32]
+
+    @classmethod
+    def of_recordings(cls, recordings: Sequence[Recording]) -> Rows:
+        """The rows of whole recordings."""
+        lengths = [len(recording) for recording in recordings]
+        truth = np.concatenate([recording.truth for recording in recordings])
+        boxes = np.concatenate([recording.boxes for recording in recordings])
+        elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
+        return cls(
+            names=[recording.name for recording in recordings],
+            starts=np.cumsum([0, *lengths]),
+            frame=np.concatenate([np.arange(length) for length in lengths]),
+            truth=truth,
+            truth_null=np.isnan(truth),
+            boxes=boxes,
+            box_null=np.isnan(boxes),
+            elapsed_ns=elapsed,
+            elapsed_null=elapsed == -1,
+            score=np.concatenate([recording.score for recording in recordings]),
+        )
+
+    @classmethod
+    def of_batch(cls, batch: Any) -> Rows:
+        """The rows of an Arrow record batch whose names are dictionary-encoded."""
+        column = dict(zip(batch.schema.names, batch.columns))
+        indices = column["sequence"].indices.cast("int32")
+        dictionary = [*column["sequence"].dictionary.to_pylist(), ""]
+        codes = np.where(is_null(indices), len(dictionary) - 1, to_numpy(indices, np.int32))
+        edges = np.flatnonzero(np.diff(codes)) + 1
+        starts = np.concatenate([[0], edges, [len(codes)]])
+        truth, truth_null = _boxes(column, TRUTH, len(codes))
+        boxes, box_null = _boxes(column, BOX, len(codes))
+        elapsed_null = is_null(column["elapsed_ns"])
+        score = np.full(len(codes), np.nan, np.float32)
+        if "score" in column:
+            scored = ~is_null(column["score"])
+            score[scored] = to_numpy(column["score"], np.float32)[scored]
+        return cls(
+            names=[dictionary[code] for code in codes[starts[:-1]]],
+            starts=starts,
+            frame=to_numpy(column["frame"], np.int32).astype(np.int64),
+            truth=truth,
+            truth_null=truth_null,
+            boxes=boxes,
+            box_null=box_null,
+            elapsed_ns=np.where(elapsed_null, -1, to_numpy(column["elapsed_ns"], np.int64)),
+            elapsed_null=elapsed_null,
+            score=score,
+        )
+
+    def to_batch(self, schema: Any) -> Any:
+        """The rows as an Arrow record batch of the schema."""
+        import pyarrow as pa
+
+        codes = np.repeat(np.arange(len(self.names), dtype=np.int32), np.diff(self.starts))
+        names = pa.DictionaryArray.from_arrays(from_numpy(codes), pa.array(self.names, pa.string()))
+        columns = [
+            names.cast(pa.string()),
+            from_numpy(self.frame.astype(np.int32)),
+            *(from_numpy(self.truth[:, i], ~self.truth_null[:, i]) for i in range(4)),
+            *(from_numpy(self.boxes[:, i], ~self.box_null[:, i]) for i in range(4)),
+            from_numpy(self.elapsed_ns, ~self.elapsed_null),
+            from_numpy(self.score, ~np.isnan(self.score)),
+        ]
+        return pa.RecordBatch.from_arrays(columns, schema=schema)
+
+    def recordings(self) -> Iterator[Recording]:
+        """Each run of rows as a recording."""
+        for name, start, end in zip(self.names, self.starts[:-1], self.starts[1:]):
+            run = slice(start, end)
+            yield Recording(
+                name, self.truth[run], self.boxes[run], self.elapsed_ns[run], self.score[run]
+            )
+
+
+def _boxes(column: dict[str, Any], names: tuple[str, ...], n: int) -> tuple[Floats, Bools]:
+    """Four columns as boxes and where they are null; columns that are absent are all null."""
+    boxes = np.full((n, 4), np.nan)
+    null = np.ones((n, 4), np.bool_)
+    for i, name in enumerate(names):
+        if name in column:
+            null[:, i] = is_null(column[name])
+            valid = ~null[:, i]
+            boxes[valid, i] = to_numpy(column[name], np.float64)[valid]
+    return boxes, null
