@@ -7,7 +7,7 @@ summation changes a result.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from fractions import Fraction
 
@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
+from lae_sim.errors import LaeError
 from lae_sim.forecast import ForecasterFactory, Lanes, forecast
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import (
@@ -28,6 +29,7 @@ from lae_sim.metrics import (
 )
 from lae_sim.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.run import Run
+from lae_sim.trace import batched
 
 
 @dataclass(frozen=True)
@@ -79,14 +81,14 @@ class Evaluation:
 
 
 def evaluate(
-    runs: Sequence[Run],
+    runs: Iterable[Run],
     metadata: Metadata,
     forecasters: Mapping[str, ForecasterFactory],
     sigmas: Sequence[Fraction] = (Fraction(0),),
     convention: Convention = PYSOT,
     at_arrival: bool = False,
 ) -> Evaluation:
-    """Score runs of one trace; all are worked on at once, so pass them in groups of moderate size.
+    """Score the runs of one trace, in groups, so that memory does not grow with the trace.
 
     Args:
         runs: one per sequence, all of one clock.
@@ -95,7 +97,28 @@ def evaluate(
         sigmas: distinct permitted latencies in frames, ascending.
         convention: how frames and thresholds count.
         at_arrival: score outputs at their own frames, as VOT does (see :func:`pair`).
+
+    Raises:
+        LaeError: if there is no run, or whatever iterating over the runs raises.
     """
+    parts = [
+        _evaluate_group(group, metadata, forecasters, sigmas, convention, at_arrival)
+        for group in batched(runs)
+    ]
+    if not parts:
+        raise LaeError("there is nothing to evaluate: no sequences")
+    return Evaluation.joined(parts)
+
+
+def _evaluate_group(
+    runs: Sequence[Run],
+    metadata: Metadata,
+    forecasters: Mapping[str, ForecasterFactory],
+    sigmas: Sequence[Fraction],
+    convention: Convention,
+    at_arrival: bool,
+) -> Evaluation:
+    """Score some runs at once."""
     pairing = pair([run.schedule for run in runs], sigmas, at_arrival)
     scorer = _Scorer(runs, convention)
     per_forecaster = [

@@ -58,16 +58,16 @@ class Convention:
     def valid_success(self, truth: Floats) -> Bools:
         """Where the truth counts for success, bool [n]."""
         if self.valid == "size":
-            return np.all(truth[:, 2:] > 0, axis=1)
+            return _all(truth[:, 2:] > 0)
         if self.valid == "positive":
-            return np.all(truth > 0, axis=1)
-        return ~np.any(np.isnan(truth), axis=1)
+            return _all(truth > 0)
+        return _all(~np.isnan(truth))
 
     def valid_precision(self, truth: Floats) -> Bools:
         """Where the truth counts for precision, bool [n]."""
         if self.leaves_out:
             return self.valid_success(truth)
-        return np.all(centre(truth) > 0, axis=1)
+        return _all(centre(truth) > 0)
 
 
 CONVENTIONS = {
@@ -151,6 +151,11 @@ def frame_counts(
         norm=len(NORM_THRESHOLDS) - np.searchsorted(NORM_THRESHOLDS, norm_error),
         within50=(error <= CENTRE_THRESHOLDS[-1]).astype(np.int64),
     )
+
+
+def _all(flags: Bools) -> Bools:
+    every: Bools = np.logical_and.reduce(flags, axis=1)
+    return every
 
 
 def _length(vectors: Floats) -> Floats:

@@ -7,11 +7,11 @@ the file, and a trace is written whole or not at all. Nothing in a trace is ever
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from lae_sim.recording import Recording
 from lae_sim.rows import BOX, TRUTH, Rows
 
 BATCH_ROWS = 1 << 16
+Frames = TypeVar("Frames", bound=Sized)
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class Trace:
 
     metadata: Metadata
     recordings: Iterable[Recording]
+    frames: int | None = None
+    """World frames of all its sequences together, where known."""
 
     def __iter__(self) -> Iterator[Recording]:
         return iter(self.recordings)
@@ -52,7 +55,8 @@ def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None =
             column, sequence and frame, and the likely cause.
     """
     stored = _StoredRecordings(Path(path), None if sequences is None else frozenset(sequences))
-    return Trace(stored.metadata(), stored)
+    metadata, rows = stored.describe()
+    return Trace(metadata, stored, rows)
 
 
 def validate(path: str | os.PathLike[str]) -> None:
@@ -103,14 +107,14 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
             writer.write_batch(rows.to_batch(schema))
 
 
-def batched(recordings: Iterable[Recording], rows: int = BATCH_ROWS) -> Iterator[list[Recording]]:
-    """Recordings in groups of about ``rows`` world frames together."""
-    group: list[Recording] = []
+def batched(items: Iterable[Frames], frames: int = BATCH_ROWS) -> Iterator[list[Frames]]:
+    """Recordings or runs in groups of about ``frames`` world frames together."""
+    group: list[Frames] = []
     pending = 0
-    for recording in recordings:
-        group.append(recording)
-        pending += len(recording)
-        if pending >= rows:
+    for item in items:
+        group.append(item)
+        pending += len(item)
+        if pending >= frames:
             yield group
             group, pending = [], 0
     if group:
@@ -124,7 +128,8 @@ class _StoredRecordings:
     path: Path
     keep: frozenset[str] | None
 
-    def metadata(self) -> Metadata:
+    def describe(self) -> tuple[Metadata, int]:
+        """The file's metadata and its number of rows."""
         with self._opened() as file:
             check_schema(file.schema_arrow, str(self.path))
             stored = (file.schema_arrow.metadata or {}).get(b"lae_sim")
@@ -134,7 +139,7 @@ class _StoredRecordings:
                     "See 'lae-sim convert --help' to make one"
                 )
             try:
-                return Metadata.parse(stored)
+                return Metadata.parse(stored), file.metadata.num_rows
             except TraceError as error:
                 raise TraceError(f"{self.path}: {error}") from error
 

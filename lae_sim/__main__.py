@@ -1,0 +1,7 @@
+"""``python -m lae_sim`` is ``lae-sim``."""
+
+import sys
+
+from lae_sim.cli import main
+
+sys.exit(main())

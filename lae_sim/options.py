@@ -1,0 +1,68 @@
+"""Policies and latency sources by the names that command lines use."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from lae_sim.clock import parse_duration
+from lae_sim.errors import LaeError
+
+if TYPE_CHECKING:
+    from lae_sim.engine import Policy
+    from lae_sim.latency import LatencySource
+
+
+def parse_policy(text: str) -> tuple[Policy, bool]:
+    """A policy by name, and whether its outputs count from their own frames' arrival.
+
+    Raises:
+        LaeError: if there is none of that name, or its value does not fit.
+    """
+    from lae_sim import policies
+
+    name, _, value = text.partition(":")
+    if text == "latest":
+        return policies.latest, False
+    if text == "fifo":
+        return policies.fifo, False
+    if name == "every":
+        return policies.every(_whole(text, value, least=1)), False
+    if name == "shrinking-tail" and value:
+        return policies.shrinking_tail(parse_duration(value)), False
+    if name == "vot-realtime":
+        return policies.vot_realtime(*([_whole(text, value)] if value else [])), True
+    raise LaeError(
+        f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
+        "vot-realtime[:GRACE]"
+    )
+
+
+def parse_latency(text: str) -> LatencySource:
+    """A latency source by name.
+
+    Raises:
+        LaeError: if there is none of that name, or its value does not fit.
+    """
+    from lae_sim import latency
+
+    name, _, value = text.partition(":")
+    if text == "recorded":
+        return latency.by_frame
+    if text == "by-call":
+        return latency.by_call
+    if name == "constant":
+        return latency.constant(parse_duration(value))
+    if name == "resample":
+        return latency.resampled(_whole(text, value))
+    if name == "lognormal":
+        return latency.lognormal(_whole(text, value))
+    raise LaeError(
+        f"no latency {text!r}: there are recorded, by-call, constant:47ms, resample:SEED, "
+        "lognormal:SEED"
+    )
+
+
+def _whole(text: str, value: str, least: int = 0) -> int:
+    if not (value.isascii() and value.isdigit() and len(value) < 19 and int(value) >= least):
+        raise LaeError(f"{text!r} needs a whole number from {least} after the colon")
+    return int(value)

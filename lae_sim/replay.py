@@ -1,0 +1,262 @@
+"""``python -m lae_sim.replay``: replay traces and score them, latency counted."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+from lae_sim.cli import argument, exit_status
+from lae_sim.clock import parse_fps, parse_rational
+from lae_sim.errors import LaeError
+from lae_sim.options import parse_latency, parse_policy
+
+if TYPE_CHECKING:
+    from lae_sim.forecast import ForecasterFactory
+    from lae_sim.metadata import Metadata
+    from lae_sim.report import Report
+    from lae_sim.run import Run
+
+PROGRAM = "lae-sim replay"
+
+EXAMPLES = """\
+examples:
+  lae-sim replay trace.parquet
+  lae-sim replay trace.parquet --latency constant:47ms --forecaster hold kalman --sigma-grid
+  lae-sim replay desktop.parquet --timing jetson.parquet      boxes of one device, times of another
+  lae-sim replay a.parquet b.parquet --latency-scale 2 --json | jq '.traces[].results[].auc'
+  lae-sim replay trace.parquet --forecaster my_package.my_module:MyForecaster --per-sequence
+
+forecasters:  hold, constant-velocity, kalman (the paper's), kalman-lae-pvt (the released code's),
+              package.module:factory (your own)
+policies:     latest, fifo, every:N, shrinking-tail:TIME (expected processing time, such as 47ms),
+              vot-realtime[:GRACE] (the VOT toolkit's rule: it skips frames, never scores latency)
+latencies:    recorded, by-call, constant:TIME, resample:SEED, lognormal:SEED
+conventions:  pysot, elae, otb, got10k, got10k-101, exclude
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Replay traces in a discrete-event simulation and score them, latency counted.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = made.add_argument
+    add("traces", nargs="+", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")
+    world = made.add_argument_group("the world and the tracker")
+    add = world.add_argument
+    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
+    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
+    add(
+        "--latency", default="recorded", help="where processing times come from (default: recorded)"
+    )
+    add(
+        "--latency-scale",
+        type=argument(parse_rational),
+        default=Fraction(1),
+        metavar="FACTOR",
+        help="multiply all times by an exact factor, such as 2 or 1/3",
+    )
+    add("--timing", metavar="TRACE", help="take the times from another device's trace")
+    scores = made.add_argument_group("forecasting and scores")
+    add = scores.add_argument
+    add(
+        "--forecaster",
+        nargs="+",
+        default=["hold", "kalman"],
+        metavar="NAME",
+        help="post-forecasters to compare (default: hold kalman)",
+    )
+    sigma = scores.add_mutually_exclusive_group()
+    sigma.add_argument(
+        "--sigma",
+        nargs="+",
+        type=argument(parse_rational),
+        default=[Fraction(0)],
+        metavar="FRAMES",
+        help="permitted latencies: frame i is queried at (i + sigma) / fps (default: 0)",
+    )
+    sigma.add_argument(
+        "--eta",
+        nargs="+",
+        type=argument(parse_rational),
+        metavar="FRAMES",
+        help="the same with the sign of sAP: frame i is queried at (i - eta) / fps",
+    )
+    add("--sigma-grid", action="store_true", help="add mAUC and mDP over sigma = 0, 0.02, ..., 1")
+    add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
+    add("--sequence", nargs="+", metavar="NAME", help="replay these sequences only")
+    output = made.add_argument_group("output")
+    add = output.add_argument
+    add("--per-sequence", action="store_true", help="report each sequence")
+    add("--attributes", action="store_true", help="report each attribute of the dataset")
+    add("--json", action="store_true", help="print one JSON object instead of tables")
+    add("--outputs", metavar="FILE", help="write every answer to a Parquet file")
+    add("--schedule", metavar="FILE", help="write every processed frame's ticks to a Parquet file")
+    add("--events", metavar="FILE", help="write the event log of the first sigma as JSON lines")
+    add("--export-txt", metavar="DIR", help="write result text files for the pysot toolkit")
+    add("--plot", metavar="FILE", help="draw success and precision (.png, .svg, .pdf)")
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status is 2 for bad input."""
+    arguments = parser().parse_args(argv)
+    return exit_status(lambda: _replay(arguments), PROGRAM)
+
+
+def _replay(arguments: argparse.Namespace) -> None:
+    import json
+
+    from lae_sim import __version__
+    from lae_sim.pairing import SIGMA_GRID
+
+    single = [name for name in ("outputs", "schedule", "events") if getattr(arguments, name)]
+    if single and len(arguments.traces) > 1:
+        raise LaeError(f"--{single[0]} takes one trace at a time")
+    if arguments.eta is not None:
+        arguments.sigma = [-eta for eta in arguments.eta]
+    shown = sorted({float(sigma) for sigma in arguments.sigma})
+    sigmas = sorted({*arguments.sigma, *(SIGMA_GRID if arguments.sigma_grid else ())})
+    reports = [_replay_one(path, arguments, sigmas) for path in arguments.traces]
+    if arguments.json:
+        document = {"format": "lae-replay", "version": "1.0", "lae_sim": __version__}
+        print(json.dumps({**document, "traces": reports}, indent=2, allow_nan=False))
+        return
+    _print_tables(reports, shown, arguments)
+
+
+def _replay_one(path: str, arguments: argparse.Namespace, sigmas: list[Fraction]) -> Report:
+    """Replay and score one trace, and write the files that were asked for."""
+    from lae_sim.clock import Clock
+    from lae_sim.evaluation import evaluate
+    from lae_sim.forecast import load_forecaster
+    from lae_sim.latency import scaled
+    from lae_sim.metrics import find_convention
+    from lae_sim.report import attribute_members, trace_report
+    from lae_sim.run import replay_trace
+    from lae_sim.trace import read_trace
+
+    convention = find_convention(arguments.convention)
+    policy, at_arrival = parse_policy(arguments.policy)
+    source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
+    names = dict.fromkeys(["hold", *arguments.forecaster])  # hold is the baseline of all
+    factories = {name: load_forecaster(name) for name in names}
+    trace = read_trace(path, arguments.sequence)
+    timing = read_trace(arguments.timing) if arguments.timing else None
+    metadata = trace.metadata
+    fps = arguments.fps or metadata.fps
+    with ExitStack() as files:
+        runs = _progress(replay_trace(trace, fps, source, policy, timing), path, trace.frames)
+        sinks = _sinks(files, arguments, path, factories, sigmas, metadata, at_arrival)
+        evaluation = evaluate(
+            _written(runs, sinks), metadata, factories, sigmas, convention, at_arrival
+        )
+    members = attribute_members(metadata, evaluation.sequences)
+    if arguments.attributes and not members:
+        raise LaeError(f"{path}: the trace names no attributes of its sequences")
+    return {
+        "trace": path,
+        "tracker": metadata.tracker,
+        "device": metadata.device,
+        "times_from": arguments.timing or path,
+        "times_note": (timing or trace).metadata.timing_note,
+        "fps": str(fps),
+        "policy": arguments.policy,
+        "latency": arguments.latency,
+        "latency_scale": str(arguments.latency_scale),
+        "convention": convention.name,
+        **trace_report(
+            evaluation,
+            Clock.at(fps),
+            list(factories),
+            sigmas,
+            convention.name,
+            members if arguments.attributes else None,
+            arguments.per_sequence,
+        ),
+    }
+
+
+def _sinks(
+    files: ExitStack,
+    arguments: argparse.Namespace,
+    path: str,
+    factories: Mapping[str, ForecasterFactory],
+    sigmas: Sequence[Fraction],
+    metadata: Metadata,
+    at_arrival: bool,
+) -> list[Callable[[Run], None]]:
+    """Open the files that were asked for; what each does with a run."""
+    from pathlib import Path
+
+    from lae_sim import export
+    from lae_sim.clock import Clock
+    from lae_sim.evaluation import answers
+
+    sinks: list[Callable[[Run], None]] = []
+    answer_sinks: list[export.AnswerSink] = []
+    if arguments.schedule:
+        clock = Clock.at(arguments.fps or metadata.fps)
+        sinks.append(files.enter_context(export.schedule_file(arguments.schedule, clock)))
+    if arguments.events:
+        events = export.events_file(arguments.events, arguments.sigma[0], at_arrival)
+        sinks.append(files.enter_context(events))
+    if arguments.outputs:
+        answer_sinks.append(files.enter_context(export.outputs_file(arguments.outputs)))
+    if arguments.export_txt:
+        names = export.result_names(Path(path).stem, arguments.forecaster, sigmas)
+        folders = export.result_folders(arguments.export_txt, names)
+        answer_sinks.append(files.enter_context(folders))
+
+    def answer(run: Run) -> None:
+        for name in dict.fromkeys(arguments.forecaster):
+            for sigma in sigmas:
+                found = answers(run, metadata, name, factories[name], sigma, at_arrival)
+                for sink in answer_sinks:
+                    sink(run, name, sigma, found)
+
+    return [*sinks, answer] if answer_sinks else sinks
+
+
+def _written(runs: Iterable[Run], sinks: Sequence[Callable[[Run], None]]) -> Iterator[Run]:
+    """The runs, each given to every sink as it passes."""
+    for run in runs:
+        for sink in sinks:
+            sink(run)
+        yield run
+
+
+def _progress(runs: Iterable[Run], path: str, frames: int | None) -> Iterator[Run]:
+    """The runs, with a progress bar if the standard error stream is a terminal."""
+    from tqdm import tqdm
+
+    with tqdm(total=frames, desc=path, unit=" frames", unit_scale=True, disable=None) as bar:
+        for run in runs:
+            yield run
+            bar.update(len(run))
+
+
+def _print_tables(
+    reports: Sequence[Report], shown: Sequence[float], arguments: argparse.Namespace
+) -> None:
+    from lae_sim.report import attribute_table, sequence_table, settings_text, summary_table
+
+    for report in reports:
+        if arguments.per_sequence:
+            print(f"{report['trace']}\n\n{sequence_table(report, shown)}\n")
+        if arguments.attributes:
+            print(f"{report['trace']}\n\n{attribute_table(report, shown)}\n")
+    print(summary_table(reports, shown), end="\n\n")
+    for report in reports:
+        print(settings_text(report))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
