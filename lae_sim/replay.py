@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -15,10 +16,12 @@ from lae_sim.errors import LaeError
 from lae_sim.options import parse_latency, parse_policy
 
 if TYPE_CHECKING:
+    from lae_sim.clock import Clock
     from lae_sim.forecast import ForecasterFactory
-    from lae_sim.metadata import Metadata
+    from lae_sim.metrics import Convention
     from lae_sim.report import Report
     from lae_sim.run import Run
+    from lae_sim.trace import Trace
 
 PROGRAM = "lae-sim replay"
 
@@ -124,101 +127,139 @@ def _replay(arguments: argparse.Namespace) -> None:
         arguments.sigma = [-eta for eta in arguments.eta]
     shown = sorted({float(sigma) for sigma in arguments.sigma})
     sigmas = sorted({*arguments.sigma, *(SIGMA_GRID if arguments.sigma_grid else ())})
-    reports = [_replay_one(path, arguments, sigmas) for path in arguments.traces]
+    jobs = [_Job.of(path, arguments, sigmas) for path in arguments.traces]
+    with ExitStack() as files:  # whatever fails, no file is left behind
+        reports = [_report(job, _sinks(job, arguments, files), arguments) for job in jobs]
+        if arguments.plot:
+            _plot(jobs, arguments.sigma[0], arguments.plot)
     if arguments.json:
         document = {"format": "lae-replay", "version": "1.0", "lae_sim": __version__}
         print(json.dumps({**document, "traces": reports}, indent=2, allow_nan=False))
-        return
-    _print_tables(reports, shown, arguments)
+    else:
+        _print_tables(reports, shown, arguments)
 
 
-def _replay_one(path: str, arguments: argparse.Namespace, sigmas: list[Fraction]) -> Report:
-    """Replay and score one trace, and write the files that were asked for."""
-    from lae_sim.clock import Clock
-    from lae_sim.evaluation import evaluate
-    from lae_sim.forecast import load_forecaster
-    from lae_sim.latency import scaled
-    from lae_sim.metrics import find_convention
-    from lae_sim.report import attribute_members, trace_report
-    from lae_sim.run import replay_trace
-    from lae_sim.trace import read_trace
+@dataclass(frozen=True)
+class _Job:
+    """One trace and how it is replayed and scored.
 
-    convention = find_convention(arguments.convention)
-    policy, at_arrival = parse_policy(arguments.policy)
-    source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
-    names = dict.fromkeys(["hold", *arguments.forecaster])  # hold is the baseline of all
-    factories = {name: load_forecaster(name) for name in names}
-    trace = read_trace(path, arguments.sequence)
-    timing = read_trace(arguments.timing) if arguments.timing else None
-    metadata = trace.metadata
-    fps = arguments.fps or metadata.fps
-    with ExitStack() as files:
-        runs = _progress(replay_trace(trace, fps, source, policy, timing), path, trace.frames)
-        sinks = _sinks(files, arguments, path, factories, sigmas, metadata, at_arrival)
-        evaluation = evaluate(
-            _written(runs, sinks), metadata, factories, sigmas, convention, at_arrival
+    Attributes:
+        path: the trace's file.
+        trace: the trace.
+        timing: the trace that the times come from, if it is another.
+        clock: the world's clock.
+        runs: replays the sequences, from the first, each time it is called.
+        at_arrival: whether outputs count from their own frames' arrival.
+        forecasters: factories by name; hold, the baseline of all comparisons, is always there.
+        sigmas: permitted latencies, ascending.
+        convention: how frames and thresholds count.
+    """
+
+    path: str
+    trace: Trace
+    timing: Trace | None
+    clock: Clock
+    runs: Callable[[], Iterator[Run]]
+    at_arrival: bool
+    forecasters: Mapping[str, ForecasterFactory]
+    sigmas: Sequence[Fraction]
+    convention: Convention
+
+    @classmethod
+    def of(cls, path: str, arguments: argparse.Namespace, sigmas: Sequence[Fraction]) -> _Job:
+        from lae_sim.clock import Clock
+        from lae_sim.forecast import load_forecaster
+        from lae_sim.latency import scaled
+        from lae_sim.metrics import find_convention
+        from lae_sim.run import replay_trace
+        from lae_sim.trace import read_trace
+
+        policy, at_arrival = parse_policy(arguments.policy)
+        source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
+        trace = read_trace(path, arguments.sequence)
+        timing = read_trace(arguments.timing) if arguments.timing else None
+        fps = arguments.fps or trace.metadata.fps
+        return cls(
+            path=path,
+            trace=trace,
+            timing=timing,
+            clock=Clock.at(fps),
+            runs=lambda: replay_trace(trace, fps, source, policy, timing),
+            at_arrival=at_arrival,
+            forecasters={name: load_forecaster(name) for name in ["hold", *arguments.forecaster]},
+            sigmas=sigmas,
+            convention=find_convention(arguments.convention),
         )
+
+
+def _report(
+    job: _Job, sinks: Sequence[Callable[[Run], None]], arguments: argparse.Namespace
+) -> Report:
+    """Replay and score one trace, giving each run to the sinks."""
+    from lae_sim.evaluation import evaluate
+    from lae_sim.report import attribute_members, trace_report
+
+    metadata = job.trace.metadata
+    runs = _written(_progress(job.runs(), job.path, job.trace.frames), sinks)
+    evaluation = evaluate(
+        runs, metadata, job.forecasters, job.sigmas, job.convention, job.at_arrival
+    )
     members = attribute_members(metadata, evaluation.sequences)
     if arguments.attributes and not members:
-        raise LaeError(f"{path}: the trace names no attributes of its sequences")
+        raise LaeError(f"{job.path}: the trace names no attributes of its sequences")
+    figures = trace_report(
+        evaluation,
+        job.clock,
+        list(job.forecasters),
+        job.sigmas,
+        job.convention.name,
+        members if arguments.attributes else None,
+        arguments.per_sequence,
+    )
     return {
-        "trace": path,
+        "trace": job.path,
         "tracker": metadata.tracker,
         "device": metadata.device,
-        "times_from": arguments.timing or path,
-        "times_note": (timing or trace).metadata.timing_note,
-        "fps": str(fps),
+        "times_from": arguments.timing or job.path,
+        "times_note": (job.timing or job.trace).metadata.timing_note,
+        "fps": str(job.clock.fps),
         "policy": arguments.policy,
         "latency": arguments.latency,
         "latency_scale": str(arguments.latency_scale),
-        "convention": convention.name,
-        **trace_report(
-            evaluation,
-            Clock.at(fps),
-            list(factories),
-            sigmas,
-            convention.name,
-            members if arguments.attributes else None,
-            arguments.per_sequence,
-        ),
+        "convention": job.convention.name,
+        **figures,
     }
 
 
 def _sinks(
-    files: ExitStack,
-    arguments: argparse.Namespace,
-    path: str,
-    factories: Mapping[str, ForecasterFactory],
-    sigmas: Sequence[Fraction],
-    metadata: Metadata,
-    at_arrival: bool,
+    job: _Job, arguments: argparse.Namespace, files: ExitStack
 ) -> list[Callable[[Run], None]]:
     """Open the files that were asked for; what each does with a run."""
     from pathlib import Path
 
     from lae_sim import export
-    from lae_sim.clock import Clock
     from lae_sim.evaluation import answers
 
     sinks: list[Callable[[Run], None]] = []
     answer_sinks: list[export.AnswerSink] = []
+    exported = dict.fromkeys(arguments.forecaster)
     if arguments.schedule:
-        clock = Clock.at(arguments.fps or metadata.fps)
-        sinks.append(files.enter_context(export.schedule_file(arguments.schedule, clock)))
+        sinks.append(files.enter_context(export.schedule_file(arguments.schedule, job.clock)))
     if arguments.events:
-        events = export.events_file(arguments.events, arguments.sigma[0], at_arrival)
+        events = export.events_file(arguments.events, arguments.sigma[0], job.at_arrival)
         sinks.append(files.enter_context(events))
     if arguments.outputs:
         answer_sinks.append(files.enter_context(export.outputs_file(arguments.outputs)))
     if arguments.export_txt:
-        names = export.result_names(Path(path).stem, arguments.forecaster, sigmas)
+        names = export.result_names(Path(job.path).stem, list(exported), job.sigmas)
         folders = export.result_folders(arguments.export_txt, names)
         answer_sinks.append(files.enter_context(folders))
 
     def answer(run: Run) -> None:
-        for name in dict.fromkeys(arguments.forecaster):
-            for sigma in sigmas:
-                found = answers(run, metadata, name, factories[name], sigma, at_arrival)
+        for name in exported:
+            factory = job.forecasters[name]
+            for sigma in job.sigmas:
+                found = answers(run, job.trace.metadata, name, factory, sigma, job.at_arrival)
                 for sink in answer_sinks:
                     sink(run, name, sigma, found)
 
@@ -241,6 +282,22 @@ def _progress(runs: Iterable[Run], path: str, frames: int | None) -> Iterator[Ru
         for run in runs:
             yield run
             bar.update(len(run))
+
+
+def _plot(jobs: Sequence[_Job], sigma: Fraction, path: str) -> None:
+    """Draw success and precision of all traces."""
+    from pathlib import Path
+
+    from lae_sim import plots
+
+    named: plots.Curves = {}
+    for job in jobs:
+        found = plots.curves(
+            job.runs(), job.trace.metadata, job.forecasters, sigma, job.convention, job.at_arrival
+        )
+        prefix = f"{Path(job.path).stem}: " if len(jobs) > 1 else ""
+        named.update({prefix + name: curve for name, curve in found.items()})
+    plots.save(plots.success_and_precision(named), path)
 
 
 def _print_tables(

@@ -208,7 +208,7 @@ def settings_text(report: Report) -> str:
         + f" (initialisation {report['init_ms']:.1f} ms)",
     ]
     if report["times_note"] is not None:
-        lines.append(f"  times are not measured per frame: {report['times_note']}")
+        lines.append(f"  times: {report['times_note']}")
     if report["policy"].startswith("vot-realtime"):
         lines.append("  vot-realtime skips frames but never scores latency")
     if report["exact"]:
@@ -224,9 +224,9 @@ def settings_text(report: Report) -> str:
 
 def attribute_table(report: Report, shown_sigmas: Sequence[float]) -> str:
     """One line per attribute and forecaster."""
-    header = ["attribute", "sequences", "forecaster", "sigma", "AUC", "recovered", "DP@20"]
+    header = ["attribute", "forecaster", "sequences", "sigma", "AUC", "recovered", "DP@20"]
     lines = [
-        [name, str(scores["sequences"]), result["forecaster"], f"{result['sigma']:g}"]
+        [name, result["forecaster"], str(scores["sequences"]), f"{result['sigma']:g}"]
         + [_score(scores["auc"]), _percent(scores["recovered_auc"]), _score(scores["dp20"])]
         for result in _shown(report, shown_sigmas)
         for name, scores in result["attributes"].items()
@@ -254,14 +254,14 @@ def _shown(report: Report, shown_sigmas: Sequence[float]) -> list[Report]:
     return [result for result in report["results"] if result["sigma"] in shown_sigmas]
 
 
-def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Aligned columns of text: the first two to the left, the others to the right."""
+def table(header: Sequence[str], lines: Sequence[Sequence[str]], left: int = 2) -> str:
+    """Aligned columns of text: the first ``left`` to the left, the others to the right."""
     columns = list(zip(header, *lines))
     widths = [max(map(len, column)) for column in columns]
 
     def aligned(cells: Sequence[str]) -> str:
         padded = [
-            cell.ljust(width) if i < 2 else cell.rjust(width)
+            cell.ljust(width) if i < left else cell.rjust(width)
             for i, (cell, width) in enumerate(zip(cells, widths))
         ]
         return "  ".join(padded).rstrip()

@@ -1,0 +1,38 @@
+# `make demo` and `make test` need only Python 3.10 or newer and access to the package index.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint bench samples clean
+
+demo: $(VENV)/.demo  ## replay the sample traces
+	$(BIN)/lae-sim replay traces/synthetic-slow.parquet traces/synthetic-fast.parquet --sigma-grid
+
+test: $(VENV)/.test  ## run the tests
+	$(BIN)/python -m pytest -n auto
+
+lint: $(VENV)/.dev  ## format, lint and types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: $(VENV)/.test  ## measure speed and memory
+	$(BIN)/python benchmarks/run.py
+
+samples: $(VENV)/.demo  ## make the sample traces anew
+	$(BIN)/python traces/make_samples.py
+	$(BIN)/python traces/make_cases.py
+
+clean:
+	rm -rf $(VENV)
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.demo: $(BIN)/python pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(VENV)/.test $(VENV)/.dev: $(VENV)/.%: $(BIN)/python pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	touch $@

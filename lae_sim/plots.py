@@ -1,0 +1,152 @@
+"""Pictures of a replay (extra ``plot``): success and precision, and the timeline of a sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lae_sim.boxes import Floats
+from lae_sim.errors import LaeError
+from lae_sim.evaluation import answers
+from lae_sim.forecast import ForecasterFactory
+from lae_sim.metadata import Metadata
+from lae_sim.metrics import CENTRE_THRESHOLDS, PYSOT, Convention, precision_curve, success_curve
+from lae_sim.pairing import pair
+from lae_sim.run import Run
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Curves = dict[str, tuple[Floats, Floats]]
+"""By name: success over IoU thresholds, and precision over 0..50 px, mean over sequences."""
+
+
+def curves(
+    runs: Iterable[Run],
+    metadata: Metadata,
+    forecasters: Mapping[str, ForecasterFactory],
+    sigma: Fraction = Fraction(0),
+    convention: Convention = PYSOT,
+    at_arrival: bool = False,
+) -> Curves:
+    """Curves of the offline boxes, where the trace holds every frame, and of each forecaster."""
+    per_name: dict[str, list[tuple[Floats, Floats]]] = {}
+    for run in runs:
+        truth = run.recording.truth
+        boxes = {"offline": run.recording.boxes}
+        for name, factory in forecasters.items():
+            boxes[name] = answers(run, metadata, name, factory, sigma, at_arrival).boxes
+        for name, answered in boxes.items():
+            success = success_curve(truth, answered, convention)
+            precision = precision_curve(truth, answered, convention)
+            per_name.setdefault(name, []).append((success, precision))
+            if np.isnan(answered).any():
+                per_name[name] = [(success * np.nan, precision * np.nan)]
+    means = {
+        name: (np.mean([s for s, _ in pairs], axis=0), np.mean([p for _, p in pairs], axis=0))
+        for name, pairs in per_name.items()
+    }
+    return {name: found for name, found in means.items() if not np.isnan(found[0]).any()}
+
+
+def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Figure:
+    """Success and precision plots side by side, AUC and DP at 20 px in the legends."""
+    figure: Figure
+    figure, (left, right) = _pyplot().subplots(1, 2, figsize=(10, 4.2), layout="constrained")
+    figure.suptitle(title)
+    for name, (success, precision) in named.items():
+        style = "--" if name == "offline" else "-"
+        overlap = np.linspace(0, 1, len(success))
+        left.plot(overlap, success, style, label=f"{name} [{success.mean():.3f}]")
+        right.plot(CENTRE_THRESHOLDS, precision, style, label=f"{name} [{precision[20]:.3f}]")
+    left.set(xlabel="overlap threshold", ylabel="success", xlim=(0, 1), ylim=(0, 1))
+    right.set(xlabel="centre error threshold (px)", ylabel="precision", xlim=(0, 50), ylim=(0, 1))
+    left.legend(title="AUC", loc="lower left")
+    right.legend(title="at 20 px", loc="lower right")
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+    return figure
+
+
+def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int = 20) -> Figure:
+    """When frames arrived and were processed or skipped, and which output answered each query.
+
+    Args:
+        run: one replayed sequence.
+        sigma: permitted latency of the queries, frames.
+        first: first world frame shown.
+        count: number of world frames shown.
+    """
+    schedule = run.schedule
+    clock = schedule.clock
+    end = min(first + count, schedule.length)
+    figure: Figure
+    figure, axes = _pyplot().subplots(figsize=(12, 3.6), layout="constrained")
+    processed = set(schedule.frames.tolist())
+    for frame in range(first, end):
+        taken = frame in processed
+        colour = "tab:blue" if taken else "tab:red"
+        axes.plot(
+            frame * clock.frame_ms, 2, "o", color=colour, fillstyle="full" if taken else "none"
+        )
+        axes.annotate(str(frame), (frame * clock.frame_ms, 2.18), ha="center", fontsize=7)
+    ticks_per_ms = clock.ticks_per_ns * 1e6
+    for frame, start, ready in zip(schedule.frames, schedule.start, schedule.ready):
+        if ready >= first * clock.frame_ticks and frame < end:
+            begin, length = start / ticks_per_ms, (ready - start) / ticks_per_ms
+            axes.barh(1, length, left=begin, height=0.42, color="tab:blue", edgecolor="white")
+            if begin + length / 2 < (end + 0.5) * clock.frame_ms:
+                axes.text(begin + length / 2, 1, str(frame), ha="center", va="center", color="w")
+    _draw_queries(axes, run, sigma, first, end)
+    axes.set_yticks(
+        [2, 1, 0], ["world frame\n(hollow: skipped)", "tracker busy", "query and source"]
+    )
+    axes.set(ylim=(-0.6, 2.5), xlabel="time (ms)", title=f"{run.recording.name}: who answers what")
+    axes.set_xlim((first - 0.5) * clock.frame_ms, (end + 0.5) * clock.frame_ms)
+    return figure
+
+
+def _draw_queries(axes: Axes, run: Run, sigma: Fraction, first: int, end: int) -> None:
+    """A mark for each query, joined to the moment when the output that answers it was ready."""
+    schedule = run.schedule
+    clock = schedule.clock
+    pairing = pair([schedule], [sigma])
+    spans = zip(schedule.frames, schedule.ready, pairing.first[:, 0], pairing.end[:, 0])
+    for source, ready, begin, stop in spans:
+        for frame in range(max(begin, first), min(stop, end)):
+            query = float(frame + sigma) * clock.frame_ms
+            axes.plot(query, 0, "|", color="black", markersize=12)
+            axes.annotate(f"{source}", (query, -0.4), ha="center", fontsize=7)
+            if source:
+                axes.plot(
+                    [ready / clock.ticks_per_ns / 1e6, query], [0.78, 0.12], lw=0.6, color="grey"
+                )
+
+
+def save(figure: Figure, path: str) -> None:
+    """Write a figure to a file whose ending says the format.
+
+    Raises:
+        LaeError: if it cannot be written, or the ending is not known.
+    """
+    from pathlib import Path
+
+    from lae_sim.files import written_whole
+
+    ending = Path(path).suffix[1:].lower()
+    if ending not in figure.canvas.get_supported_filetypes():
+        raise LaeError(f"cannot draw to {path}: name a .png, .svg or .pdf file")
+    with written_whole(path) as temporary:
+        figure.savefig(temporary, format=ending, dpi=150)
+
+
+def _pyplot() -> Any:
+    try:
+        import matplotlib.pyplot as pyplot
+    except ImportError as error:
+        raise LaeError("pictures need matplotlib: pip install 'lae-sim[plot]'") from error
+    return pyplot

@@ -1,0 +1,228 @@
+"""Make the valid and invalid traces that other readers can be tested with.
+
+``python traces/make_cases.py [FOLDER]`` writes ``cases/valid/*.parquet``,
+``cases/invalid/*.parquet`` and ``cases/invalid/expected.json``, which gives the words that the
+refusal of each must have. It uses pyarrow alone, so that it can break every rule.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+Columns = dict[str, list[Any]]
+Types = dict[str, pa.DataType]
+Document = dict[str, Any]
+
+TYPES: Types = {
+    "sequence": pa.string(),
+    "frame": pa.int32(),
+    **{name: pa.float64() for name in ("truth_x", "truth_y", "truth_w", "truth_h", *"xywh")},
+    "elapsed_ns": pa.int64(),
+    "score": pa.float32(),
+}
+DOCUMENT: Document = {
+    "format": "lae-trace",
+    "version": "1.0",
+    "fps": "30",
+    "schedule": {"kind": "every-frame"},
+}
+
+
+def good() -> Columns:
+    """Two sequences of four frames, moving right and down."""
+    names = ["a"] * 4 + ["b"] * 4
+    frames = [0, 1, 2, 3] * 2
+    columns: Columns = {"sequence": names, "frame": frames}
+    for prefix, offset in (("truth_", 0.0), ("", 1.0)):
+        columns[f"{prefix}x"] = [100.0 + 8 * frame + offset * (frame > 0) for frame in frames]
+        columns[f"{prefix}y"] = [50.0 + 4 * frame for frame in frames]
+        columns[f"{prefix}w"] = [40.0] * 8
+        columns[f"{prefix}h"] = [30.0] * 8
+    columns["elapsed_ns"] = [90_000_000, *[20_000_000 + 1000 * i for i in range(7)]]
+    columns["score"] = [None] + [0.5] * 7
+    return columns
+
+
+def changed(column: str, row: int, value: Any) -> Columns:
+    """The good columns with one value changed."""
+    columns = good()
+    columns[column][row] = value
+    return columns
+
+
+def without(*names: str) -> Columns:
+    """The good columns without some."""
+    return {name: values for name, values in good().items() if name not in names}
+
+
+def mapped(function: Callable[[Any], Any], column: str) -> Columns:
+    """The good columns with one of them mapped."""
+    columns = good()
+    columns[column] = [function(value) for value in columns[column]]
+    return columns
+
+
+def rows(order: list[int]) -> Columns:
+    """Some of the good rows, in an order."""
+    return {name: [values[row] for row in order] for name, values in good().items()}
+
+
+def corners(*prefixes: str) -> Columns:
+    """Boxes written as x1, y1, x2, y2."""
+    columns = good()
+    for prefix in prefixes:
+        for size, start in (("w", "x"), ("h", "y")):
+            columns[prefix + size] = [
+                a + b for a, b in zip(columns[prefix + start], columns[prefix + size])
+            ]
+    return columns
+
+
+def skipping() -> Columns:
+    """A real-time run that skipped frame 1 of each sequence."""
+    columns = good()
+    for name in (*"xywh", "elapsed_ns", "score"):
+        columns[name][1] = columns[name][5] = None
+    return columns
+
+
+def no_truth() -> Columns:
+    """Truth that is missing in two frames."""
+    columns = good()
+    for name in ("truth_x", "truth_y", "truth_w", "truth_h"):
+        columns[name][2] = columns[name][5] = None
+    return columns
+
+
+def write(path: Path, columns: Columns, document: Any = DOCUMENT, types: Types = TYPES) -> None:
+    """Write a table with metadata: an object as JSON, bytes as they are, None for none."""
+    table = pa.table({name: pa.array(values, types[name]) for name, values in columns.items()})
+    if document is not None:
+        text = document if isinstance(document, bytes) else json.dumps(document).encode()
+        table = table.replace_schema_metadata({"lae_sim": text})
+    pq.write_table(table, path)
+
+
+def write_valid(folder: Path) -> None:
+    """Write files that every reader must accept."""
+    real_time = {**DOCUMENT, "schedule": {"kind": "real-time", "policy": "latest"}}
+    full = {
+        **DOCUMENT,
+        "fps": "30000/1001",
+        "tracker": {"name": "example", "settings": {"scale": 2}},
+        "device": {"model": "board", "power_mode": "15W"},
+        "timing": {"source": "measured", "clock": "perf_counter_ns", "warmup_calls": 3},
+        "dataset": {"name": "example"},
+        "sequences": {"a": {"image_size": [640, 480], "attributes": ["Occlusion"]}},
+        "a key of the future": [1, {"x": None}],
+    }
+    dictionary = pa.dictionary(pa.int32(), pa.string())
+    write(folder / "minimal.parquet", good())
+    write(folder / "full-metadata.parquet", good(), full)
+    write(folder / "minor-version.parquet", good(), {**DOCUMENT, "version": "1.7"})
+    write(folder / "real-time.parquet", skipping(), real_time)
+    write(folder / "missing-truth.parquet", no_truth())
+    write(folder / "no-truth-columns.parquet", without("truth_x", "truth_y", "truth_w", "truth_h"))
+    write(folder / "no-score-column.parquet", without("score"))
+    write(folder / "zero-time.parquet", mapped(lambda _: 0, "elapsed_ns"))
+    write(folder / "one-frame.parquet", rows([0]))
+    write(folder / "large-string.parquet", good(), types={**TYPES, "sequence": pa.large_string()})
+    write(folder / "dictionary.parquet", good(), types={**TYPES, "sequence": dictionary})
+
+
+def write_invalid(folder: Path) -> None:
+    """Write files that every reader must refuse, and the words that lae_sim refuses them with."""
+    expected: dict[str, list[str]] = {}
+
+    def bad(name: str, *words: str, columns: Columns | None = None, **how: Any) -> None:
+        write(folder / f"{name}.parquet", good() if columns is None else columns, **how)
+        expected[f"{name}.parquet"] = list(words)
+
+    def bad_document(name: str, *words: str, **changes: Any) -> None:
+        bad(name, *words, document={**DOCUMENT, **changes})
+
+    bad("metadata-missing", "lae_sim", "missing", document=None)
+    bad("metadata-not-json", "JSON", document=b"{fps: 30}")
+    bad("metadata-not-utf8", "JSON", document=b'{"format": "\xff"}')
+    bad("metadata-not-object", "object", document=[1, 2])
+    bad_document("format-other", "format", format="other")
+    bad_document("version-2", "2.0", "install", version="2.0")
+    bad_document("version-number", "version", version=1.0)
+    bad_document("fps-number", "fps", "text", fps=30)
+    bad_document("fps-zero", "fps", "above zero", fps="0")
+    bad_document("fps-division-by-zero", "fps", fps="30/0")
+    bad_document("fps-exponent", "fps", fps="3e1")
+    bad_document("kind-unknown", "schedule.kind", schedule={"kind": "sometimes"})
+    bad_document("schedule-missing", "schedule.kind", schedule=None)
+    bad_document("image-size-text", "image_size", sequences={"a": {"image_size": "640x480"}})
+    bad_document("attributes-text", "attributes", sequences={"a": {"attributes": "Occlusion"}})
+    bad_document("tracker-text", "tracker", tracker="example")
+
+    bad("column-missing", "elapsed_ns", "missing", columns=without("elapsed_ns"))
+    bad("truth-column-missing", "truth_w", "missing", columns=without("truth_w"))
+    seconds = {**TYPES, "elapsed_ns": pa.float64()}
+    in_seconds = mapped(lambda ns: ns / 1e9, "elapsed_ns")
+    bad("times-in-seconds", "elapsed_ns", "seconds", columns=in_seconds, types=seconds)
+    bad("frame-as-text", "frame", "int32", columns=mapped(str, "frame"),
+        types={**TYPES, "frame": pa.string()})  # fmt: skip
+    bad("box-in-float32", "'x'", "double", types={**TYPES, "x": pa.float32()})
+
+    bad("sequences-unsorted", "'a'", "not sorted", columns=rows([4, 5, 6, 7, 0, 1, 2, 3]))
+    bad("sequence-in-two-parts", "'a'", "not sorted", columns=rows([0, 1, 4, 5, 2, 3]))
+    bad("sequence-null", "sequence", "null", columns=changed("sequence", 0, None))
+    bad("frame-gap", "'a'", "frame 3", "missing", columns=rows([0, 1, 3, 4]))
+    bad("frame-twice", "'b'", "frame 1", "twice", columns=rows([0, 4, 5, 5, 6]))
+    bad("frames-unsorted", "frame 1", "not sorted", columns=rows([0, 1, 2, 3, 4, 5, 6, 5]))
+    bad("frames-from-one", "start at frame 0", columns=mapped(lambda i: i + 1, "frame"))
+    bad("frames-do-not-start-at-zero", "'b'", "start at frame 0", columns=rows([0, 6, 7]))
+
+    bad("box-half-null", "'w'", "'a'", "frame 2", "null", columns=changed("w", 2, None))
+    bad("truth-half-null", "'truth_y'", "frame 2", "null", columns=changed("truth_y", 2, None))
+    bad("time-null", "elapsed_ns", "frame 2", "null", columns=changed("elapsed_ns", 2, None))
+    first_skipped = good()
+    for name in (*"xywh", "elapsed_ns"):
+        first_skipped[name][4] = None
+    bad("frame-0-not-processed", "'b'", "frame 0", columns=first_skipped)
+    bad("box-nan", "'h'", "'b'", "frame 3", "nan", columns=changed("h", 7, float("nan")))
+    bad("truth-infinite", "truth_x", "inf", columns=changed("truth_x", 1, float("inf")))
+    bad("time-negative", "elapsed_ns", "negative", columns=changed("elapsed_ns", 3, -5))
+
+    in_ms = mapped(lambda ns: ns // 1_000_000, "elapsed_ns")
+    bad("times-in-milliseconds", "elapsed_ns", "milliseconds", columns=in_ms)
+    in_us = mapped(lambda ns: ns // 1000, "elapsed_ns")
+    bad("times-in-microseconds", "elapsed_ns", "microseconds", columns=in_us)
+    bad("boxes-as-corners", "x1, y1, x2, y2", columns=corners(""))
+    bad("truth-as-corners", "x1, y1, x2, y2", columns=corners("truth_"))
+    bad("both-as-corners", "x1, y1, x2, y2", columns=corners("", "truth_"))
+
+    bad("no-rows", "empty", columns={name: [] for name in good()})
+    whole = (folder / "no-rows.parquet").read_bytes()
+    for name, content in {
+        "truncated": whole[: len(whole) // 2],
+        "not-parquet": b"sequence,frame,x,y,w,h\n" * 20,
+        "empty-file": b"",
+    }.items():
+        (folder / f"{name}.parquet").write_bytes(content)
+        expected[f"{name}.parquet"] = ["Parquet"]
+    text = json.dumps(dict(sorted(expected.items())), indent=1)
+    (folder / "expected.json").write_text(text + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    """Write the cases into a folder, by default ``cases`` beside this file."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "cases"
+    for kind in ("valid", "invalid"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    write_valid(folder / "valid")
+    write_invalid(folder / "invalid")
+
+
+if __name__ == "__main__":
+    main()
