@@ -1,0 +1,54 @@
+"""Shared fixtures and the hypothesis profile."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+from lae_sim.metadata import Metadata
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SHARED = REPOSITORY.parent / "shared"
+
+settings.register_profile(
+    "lae_sim",
+    deadline=None,  # the machines that run this are shared, so times are noisy
+    max_examples=60,
+    derandomize=bool(os.environ.get("CI")),
+    print_blob=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("lae_sim")
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The root of the checkout."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Real data beside the checkout; the test skips where it is absent."""
+    folder = SHARED / "data"
+    if not folder.is_dir():
+        pytest.skip("no ../shared/data beside this checkout")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def conformance() -> Path:
+    """The cases of an independent oracle; the test skips where they are absent."""
+    folder = SHARED / "conformance"
+    if not folder.is_dir():
+        pytest.skip("no ../shared/conformance beside this checkout")
+    return folder
+
+
+@pytest.fixture
+def every_frame() -> Metadata:
+    """The smallest metadata of a trace of every frame at 30 frames/s."""
+    return Metadata.new("30", "every-frame")
