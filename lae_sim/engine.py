@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from itertools import chain
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,13 +22,8 @@ from lae_sim.errors import LaeError
 Ints = npt.NDArray[np.int64]
 
 
-class Call(NamedTuple):
-    """One call of the tracker; instants in ticks of the engine's clock."""
-
-    frame: int
-    start: int
-    ready: int
-
+Call = tuple[int, int, int]
+"""One call of the tracker: frame, start, ready; instants in ticks (a bare tuple, for speed)."""
 
 Service = Callable[[int], int]
 """``service(frame)`` processes a world frame and returns the time it took, in ns."""
@@ -37,7 +33,7 @@ Policy = Callable[[Clock, Sequence[Call]], tuple[int, int]]
 
 ``calls`` holds the calls so far, the last one being the call that has just become ready. It must
 depend on nothing else, so that a replay repeats a profile. The frame must be newer than
-``calls[-1].frame``; a frame beyond the sequence ends it.
+the last call's; a frame beyond the sequence ends it.
 """
 
 
@@ -82,13 +78,14 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
     environment = simpy.Environment()
     environment.process(_tracker(environment, length, clock, service, policy, calls))
     environment.run()
-    if calls[-1].ready > MAX_TICKS:
+    frame, _, ready = calls[-1]
+    if ready > MAX_TICKS:
         raise LaeError(
-            f"the output of frame {calls[-1].frame} is ready at tick {calls[-1].ready}, beyond "
-            f"64 bits: check the processing times, or write the frame rate {clock.fps} more simply"
+            f"the output of frame {frame} is ready at tick {ready}, beyond 64 bits: "
+            f"check the processing times, or write the frame rate {clock.fps} more simply"
         )
-    columns = np.array(calls, dtype=np.int64).T.copy()
-    return Schedule(clock, length, *columns)
+    flat = np.fromiter(chain.from_iterable(calls), np.int64, 3 * len(calls))
+    return Schedule(clock, length, *flat.reshape(-1, 3).T.copy())
 
 
 def _tracker(
@@ -100,18 +97,18 @@ def _tracker(
     calls: list[Call],
 ) -> Generator[simpy.Event, Any, None]:
     """The tracker as a SimPy process with one timeout for each frame that it processes."""
-    ticks_per_ns = clock.ticks_per_ns
-    end = length * clock.frame_ticks
+    ticks_per_ns, interval = clock.ticks_per_ns, clock.frame_ticks
+    end = length * interval
     frame = start = 0
     while True:
         elapsed_ns = service(frame)
         if elapsed_ns < 0:
             raise LaeError(f"frame {frame}: a processing time cannot be negative ({elapsed_ns} ns)")
-        calls.append(Call(frame, start, start + elapsed_ns * ticks_per_ns))
+        calls.append((frame, start, start + elapsed_ns * ticks_per_ns))
         following, begin = policy(clock, calls)
         if following >= length or begin >= end:
             return
-        if following <= frame or begin < max(start, following * clock.frame_ticks):
+        if following <= frame or begin < start or begin < following * interval:
             raise LaeError(
                 f"the policy answered frame {following} at tick {begin} after frame {frame}: "
                 "it must move forward, and cannot start a frame before its arrival"

@@ -110,6 +110,9 @@ def scaled(source: LatencySource, factor: Fraction) -> LatencySource:
     if factor < 0:
         raise LaeError(f"times cannot be scaled by {factor}, below zero")
 
+    if factor == 1:
+        return source
+
     def scaled_source(recording: Recording) -> Service:
         service = source(recording)
         if factor.denominator == 1:

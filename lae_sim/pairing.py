@@ -14,6 +14,7 @@ from fractions import Fraction
 from math import lcm
 
 import numpy as np
+import numpy.typing as npt
 
 from lae_sim.engine import Ints, Schedule
 from lae_sim.errors import LaeError
@@ -21,7 +22,9 @@ from lae_sim.errors import LaeError
 SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
 """The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames."""
 
+MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
 _NEVER = 2**62
+Frames = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,8 @@ class Pairing:
         next_steps: step of the output after it, int64 [n]; huge for the last of a sequence.
         scale: b, steps per frame.
         sigmas: m for each permitted latency m/b, ascending, int64 [M].
-        first: first world frame that each output answers, int64 [n, M].
-        end: the frame after the last one it answers, int64 [n, M]; equal to ``first`` if it
+        first: first world frame that each output answers, int32 [n, M].
+        end: the frame after the last one it answers, int32 [n, M]; equal to ``first`` if it
             answers none.
     """
 
@@ -51,36 +54,29 @@ class Pairing:
     next_steps: Ints
     scale: int
     sigmas: Ints
-    first: Ints
-    end: Ints
-
-    def per_sequence_sum(self, values: Ints) -> Ints:
-        """Sum of [n, M] values over the outputs of each sequence, [S, M]."""
-        total: Ints = np.add.reduceat(values, self.offsets[:-1], axis=0)
-        return total
-
-    def per_sequence_max(self, values: Ints) -> Ints:
-        """Maximum of [n, M] values over the outputs of each sequence, [S, M]."""
-        largest: Ints = np.maximum.reduceat(values, self.offsets[:-1], axis=0)
-        return largest
+    first: Frames
+    end: Frames
 
     @property
     def mismatch_sum(self) -> Ints:
         """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""
-        mean_twice = self.first + self.end - 1 - 2 * self.frames[:, None]
-        return self.per_sequence_sum((self.end - self.first) * mean_twice // 2)
+        source_sum = np.add.reduceat(
+            (self.end - self.first) * self.frames[:, None], self.offsets[:-1]
+        )
+        return (self.lengths * (self.lengths - 1) // 2)[:, None] - source_sum
 
     @property
     def mismatch_max(self) -> Ints:
         """Largest i - psi(i) of each sequence, frames, int64 [S, M]."""
-        used = self.end > self.first
-        oldest = np.where(used, self.end - 1 - self.frames[:, None], np.iinfo(np.int64).min)
-        return self.per_sequence_max(oldest)
+        # An output that answers nothing cannot have the maximum: the query before its turn was
+        # answered by an older one.
+        late = self.end - (self.frames + 1).astype(np.int32)[:, None]
+        return np.maximum.reduceat(late, self.offsets[:-1]).astype(np.int64)
 
     @property
     def longest_hold(self) -> Ints:
         """Most queries in a row that one output answered, frames, int64 [S, M]."""
-        return self.per_sequence_max(self.end - self.first)
+        return np.maximum.reduceat(self.end - self.first, self.offsets[:-1]).astype(np.int64)
 
 
 def pair(
@@ -103,10 +99,11 @@ def pair(
     lengths = np.array([schedule.length for schedule in schedules], np.int64)
     last_ready = max(int(schedule.ready[-1]) for schedule in schedules)
     largest = max(last_ready // interval, int(lengths.max())) * scale
-    if max(scale * interval, largest + max(map(abs, numerators))) >= _NEVER:
+    most_sigma = max(map(abs, numerators))
+    if max(scale * interval, largest + most_sigma) >= _NEVER or most_sigma > MOST_FRAMES * scale:
         raise LaeError(
-            f"the permitted latencies {', '.join(map(str, sigmas[:3]))}... are too fine for exact "
-            "64-bit arithmetic: use fewer digits"
+            f"the permitted latencies {', '.join(map(str, sigmas[:3]))}... are too fine or too "
+            "large for exact 64-bit arithmetic: use fewer digits"
         )
     counts = [len(schedule.frames) for schedule in schedules]
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
@@ -120,12 +117,21 @@ def pair(
     next_steps = np.append(steps[1:], _NEVER)
     next_steps[offsets[1:] - 1] = _NEVER
     m = np.array(numerators, np.int64)
-    limit = np.repeat(lengths, counts)[:, None]
-    first = np.clip(-((m - steps[:, None]) // scale), 0, limit)
+    first = _first_visible(steps, m, scale, np.repeat(lengths, counts))
     end = np.empty_like(first)
     end[:-1] = first[1:]
     end[offsets[1:] - 1] = lengths[:, None]
     return Pairing(lengths, offsets, frames, steps, next_steps, scale, m, first, end)
+
+
+def _first_visible(steps: Ints, sigmas: Ints, scale: int, lengths: Ints) -> Frames:
+    """ceil((K - m) / b), within 0..T, for each output and sigma; without a division for each."""
+    frame, rest = np.divmod(steps, scale)
+    whole, part = np.divmod(sigmas, scale)
+    frame = np.clip(frame, -MOST_FRAMES, MOST_FRAMES).astype(np.int32)[:, None]
+    first = frame - whole.astype(np.int32) + (rest[:, None] > part)
+    limited: Frames = np.clip(first, 0, lengths.astype(np.int32)[:, None], out=first)
+    return limited
 
 
 @dataclass(frozen=True)
@@ -193,7 +199,7 @@ def pairs(pairing: Pairing, fed: Histories) -> Pairs:
     """List the distinct pairs of frames and outputs, with the sigmas each is for."""
     history = np.repeat(np.arange(len(fed.sequence)), np.diff(fed.offsets))
     low, high = fed.sigma_from[history], fed.sigma_to[history]
-    begin = pairing.first[fed.output, high - 1]
+    begin = pairing.first[fed.output, high - 1].astype(np.int64)
     sizes = np.maximum(pairing.end[fed.output, low] - begin, 0)
     item = np.repeat(np.arange(len(history)), sizes)
     frame = ranges(begin, sizes)

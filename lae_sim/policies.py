@@ -1,8 +1,8 @@
 """Scheduling policies: which frame a free tracker processes next.
 
 Each is a plain function of the clock and the calls so far (see :data:`lae_sim.engine.Policy`), or
-makes one. ``calls[-1].ready`` is *now*, ``calls[-1].frame`` the last frame processed, and
-``now // clock.frame_ticks`` the newest frame that has arrived (equality counts).
+makes one. The last call's frame is the last one processed, the tick when it was ready is *now*, and
+``now // clock.frame_ticks`` is the newest frame that has arrived (equality counts).
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ def latest(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
     """The newest frame that has arrived, or the next to arrive (PVT 2021, Eqs. 3-4)."""
     last, _, now = calls[-1]
     newest = now // clock.frame_ticks
-    return _start(clock, now, newest if newest > last else last + 1)
+    if newest > last:
+        return newest, now
+    return last + 1, (last + 1) * clock.frame_ticks
 
 
 def fifo(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
@@ -90,8 +92,8 @@ def vot_realtime(grace: int = 3) -> Policy:
 def _late_calls(calls: Sequence[Call], interval: int, most: int) -> int:
     """How many calls took longer than a frame interval, counted up to ``most``."""
     late = 0
-    for call in calls:
-        late += call.ready - call.start > interval
+    for _, start, ready in calls:
+        late += ready - start > interval
         if late == most:
             break
     return late

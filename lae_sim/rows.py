@@ -70,7 +70,7 @@ class Rows:
     def of_batch(cls, batch: Any) -> Rows:
         """The rows of an Arrow record batch whose names are dictionary-encoded."""
         column = dict(zip(batch.schema.names, batch.columns))
-        indices = column["sequence"].indices.cast("int32")
+        indices = column["sequence"].indices
         dictionary = [*column["sequence"].dictionary.to_pylist(), ""]
         codes = np.where(is_null(indices), len(dictionary) - 1, to_numpy(indices, np.int32))
         edges = np.flatnonzero(np.diff(codes)) + 1

@@ -23,7 +23,7 @@ from lae_sim.recording import Recording
 from lae_sim.rows import BOX, TRUTH, Rows
 
 BATCH_ROWS = 1 << 16
-Frames = TypeVar("Frames", bound=Sized)
+Item = TypeVar("Item", bound=Sized)
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,9 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
             writer.write_batch(rows.to_batch(schema))
 
 
-def batched(items: Iterable[Frames], frames: int = BATCH_ROWS) -> Iterator[list[Frames]]:
+def batched(items: Iterable[Item], frames: int = BATCH_ROWS) -> Iterator[list[Item]]:
     """Recordings or runs in groups of about ``frames`` world frames together."""
-    group: list[Frames] = []
+    group: list[Item] = []
     pending = 0
     for item in items:
         group.append(item)

@@ -1,0 +1,285 @@
+"""Speed and memory, side by side in one run: ``make bench`` or ``python benchmarks/run.py``.
+
+Each figure stands beside its peer or its floor, measured in turn with it, and the medians of
+several rounds are compared. The input has the size of UAV123: 123 sequences, 112,578 frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import simpy
+from filterpy.kalman import KalmanFilter
+
+from lae_sim import (
+    Clock,
+    Kalman,
+    Metadata,
+    Recording,
+    Trace,
+    constant,
+    latest,
+    simulate,
+    write_trace,
+)
+from lae_sim.forecast import Lanes
+from lae_sim.report import table
+
+SEQUENCES, FRAMES = 123, 112_578
+ELAPSED_NS = 47_000_000
+CLOCK = Clock(30, 10**9)
+READ = """
+import sys
+import pyarrow.parquet as pq
+pq.ParquetFile(sys.argv[1]).read()
+"""
+READ_BATCHES = """
+import sys
+import pyarrow.parquet as pq
+for _ in pq.ParquetFile(sys.argv[1], pre_buffer=False).iter_batches(65536, use_threads=False):
+    pass
+"""
+REPLAY = """
+import contextlib, io, sys
+from lae_sim.replay import main
+with contextlib.redirect_stdout(io.StringIO()):
+    assert main([*sys.argv[1:], "--json"]) == 0
+"""
+# The high-water mark of this process alone: ru_maxrss would count the process that it forked from.
+PRINT_PEAK = """
+print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1])
+"""
+
+
+def lengths() -> np.ndarray:
+    """Sequence lengths that add up to the frames of UAV123."""
+    weights = np.random.default_rng(0).lognormal(0, 0.6, SEQUENCES)
+    ends = np.round(np.cumsum(weights) / weights.sum() * FRAMES).astype(int)
+    return np.diff(ends, prepend=0)
+
+
+def recordings(sizes: np.ndarray) -> Iterator[Recording]:
+    """Targets on random walks, tracked with noise, at 47 ms with jitter."""
+    for index, size in enumerate(sizes):
+        rng = np.random.default_rng([1, index])
+        path = np.cumsum(np.cumsum(rng.normal(0, 0.3, (size, 2)), axis=0), axis=0) % 900
+        truth = np.concatenate([path, np.full((size, 2), 60.0)], axis=1)
+        elapsed = (ELAPSED_NS * rng.lognormal(0, 0.1, size)).astype(np.int64)
+        yield Recording.new(f"s{index:06}", truth, truth + rng.normal(0, 3, (size, 4)), elapsed)
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """How long a call takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def medians(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Median seconds of each, measured in turn."""
+    taken: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(rounds):
+        for name, work in works.items():
+            taken[name].append(seconds(work))
+    return {name: statistics.median(times) for name, times in taken.items()}
+
+
+def plain_loop(length: int) -> list[tuple[int, int, int]]:
+    """The schedule of `latest` as a bare loop: the floor of the engine."""
+    interval, elapsed = CLOCK.frame_ticks, ELAPSED_NS * CLOCK.ticks_per_ns
+    calls, frame, start, end = [], 0, 0, length * CLOCK.frame_ticks
+    while True:
+        ready = start + elapsed
+        calls.append((frame, start, ready))
+        newest = ready // interval
+        frame = newest if newest > frame else frame + 1
+        start = max(ready, frame * interval)
+        if start >= end:
+            return calls
+
+
+def camera_and_queries(length: int) -> list[tuple[int, int]]:
+    """The plain event-driven design: a camera, a tracker and a query process, an event each."""
+    environment = simpy.Environment()
+    interval, elapsed = CLOCK.frame_ticks, ELAPSED_NS * CLOCK.ticks_per_ns
+    newest, answer, pairs = -1, 0, []
+    arrival = environment.event()
+
+    def camera() -> Iterator[simpy.Event]:
+        nonlocal newest, arrival
+        for frame in range(length):
+            newest = frame
+            arrived, arrival = arrival, environment.event()
+            arrived.succeed()
+            yield environment.timeout(interval)
+
+    def tracker() -> Iterator[simpy.Event]:
+        nonlocal answer
+        last = -1
+        while True:
+            while newest == last:
+                yield arrival
+            last = newest
+            yield environment.timeout(elapsed)
+            answer = last
+
+    def queries() -> Iterator[simpy.Event]:
+        for frame in range(length):
+            pairs.append((frame, answer))
+            yield environment.timeout(interval)
+
+    for process in (camera, tracker, queries):
+        environment.process(process())
+    environment.run(until=length * interval)
+    return pairs
+
+
+def engine_lines(rounds: int) -> list[list[str]]:
+    """The engine against its floor and the plain event-driven design, per world frame."""
+    sizes = lengths().tolist()
+    service = constant(ELAPSED_NS)(None)  # type: ignore[arg-type]  # it asks nothing of a recording
+    found = medians(
+        {
+            "engine": lambda: [simulate(size, CLOCK, service, latest) for size in sizes],
+            "plain loop": lambda: [plain_loop(size) for size in sizes],
+            "camera + query processes": lambda: [camera_and_queries(size) for size in sizes],
+        },
+        rounds,
+    )
+    return lines("schedule, constant 47 ms", found, "engine", FRAMES, "us per world frame", 1.0)
+
+
+def dense_filter() -> KalmanFilter:
+    """The paper's filter in filterpy (DESIGN: F, Q, R, H, P0)."""
+    dense = KalmanFilter(dim_x=8, dim_z=4)
+    dense.H = np.eye(4, 8)
+    dense.R = 10 * np.eye(4)
+    dense.P = 100 * np.eye(8)
+    return dense
+
+
+def kalman_lines(rounds: int) -> list[list[str]]:
+    """One update of the Kalman filter, alone and over many lanes, against filterpy."""
+    count, lanes = 200, 1000
+    rng = np.random.default_rng(2)
+    boxes = rng.normal(100, 5, (lanes * (count + 1), 4))
+    frames = np.tile(np.arange(count + 1) * 2, lanes)
+    offsets = np.arange(lanes + 1) * (count + 1)
+    many = Lanes(offsets, frames, boxes, np.full((lanes, 2), np.inf))
+    one = boxes[: count + 1].tolist()
+
+    def streaming() -> None:
+        forecaster = Kalman(one[0])
+        for k in range(1, count + 1):
+            forecaster.update(2 * k, one[k])
+
+    def filterpy() -> None:
+        dense = dense_filter()
+        transition, noise = np.eye(8), 4.0 * np.eye(8)
+        transition[:4, 4:] = 2 * np.eye(4)
+        for k in range(1, count + 1):
+            dense.predict(F=transition, Q=noise)
+            dense.update(boxes[k])
+
+    found = medians({"one at a time": streaming, "filterpy": filterpy}, rounds)
+    found[f"{lanes:,} lanes at once"] = (
+        medians({"": lambda: Kalman.run_lanes(many)}, rounds)[""] / lanes
+    )
+    return lines("kalman", found, "filterpy", count, "us per update")
+
+
+def lines(
+    what: str,
+    found: dict[str, float],
+    base: str,
+    count: int,
+    unit: str,
+    target: float | None = None,
+) -> list[list[str]]:
+    """Table lines of seconds over a number of items, with ratios to the base."""
+    return [
+        [what, name, f"{taken / count * 1e6:.3f} {unit}", f"{taken / found[base]:.2f}"]
+        + [f"<= {target:g}" if target and name == base else ""]
+        for name, taken in found.items()
+    ]
+
+
+def process(*arguments: str) -> Callable[[], object]:
+    """A whole Python process, its output thrown away."""
+    command = [sys.executable, *arguments]
+    return lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+def process_lines(trace: str, rounds: int) -> list[list[str]]:
+    """Whole processes, imports included, against reading the file."""
+    grid = ("-m", "lae_sim.replay", trace, "--sigma-grid", "--json", "--forecaster")
+    works = {
+        "read the Parquet file": process("-c", READ, trace),
+        "sigma = 0, hold": process(*grid[:3], "--json", "--forecaster", "hold"),
+        "51 sigmas, hold": process(*grid, "hold"),
+        "51 sigmas, hold + kalman": process(*grid, "hold", "kalman"),
+        "51 sigmas, hold + kalman-lae-pvt": process(*grid, "hold", "kalman-lae-pvt"),
+        "--help": process("-m", "lae_sim.replay", "--help"),
+    }
+    targets = {"51 sigmas, hold": 1.0, "51 sigmas, hold + kalman": 2.0, "--help": 0.3}
+    found = medians(works, rounds)
+    return [
+        ["whole process, UAV123 size", name, f"{taken:.2f} s"]
+        + [f"{taken / found['read the Parquet file']:.2f}"]
+        + [f"<= {targets[name]:g}" if name in targets else ""]
+        for name, taken in found.items()
+    ]
+
+
+def peak(code: str, *arguments: str) -> tuple[float, float]:
+    """Peak resident memory in MiB and seconds of a Python process (Linux)."""
+    start = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", code + PRINT_PEAK, *arguments], check=True, stdout=subprocess.PIPE
+    )
+    return int(done.stdout.split()[-1]) / 1024, time.perf_counter() - start
+
+
+def memory_lines(folder: Path, sequences: int) -> list[list[str]]:
+    """Peak memory of a trace of very many sequences, against reading the file alone."""
+    trace = str(folder / "many.parquet")
+    write_trace(Trace(Metadata.new("30", "every-frame"), recordings(np.full(sequences, 30))), trace)
+    found = {
+        "read the file in batches": peak(READ_BATCHES, trace),
+        "read the whole file": peak(READ, trace),
+        "replay, hold + kalman": peak(REPLAY, trace),
+        "the same, 51 sigmas": peak(REPLAY, trace, "--sigma-grid"),
+    }
+    base = found["read the file in batches"][0]
+    return [
+        [f"peak memory, {sequences:,} sequences", f"{name} ({taken:.1f} s)", f"{mib:.0f} MiB"]
+        + [f"{mib / base:.2f}", "<= 200" if name == "replay, hold + kalman" else ""]
+        for name, (mib, taken) in found.items()
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--rounds", type=int, default=5, help="measurements of each (default: 5)")
+    parser.add_argument("--sequences", type=int, default=100_000, help="for the peak memory")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        trace = folder / "uav123-sized.parquet"
+        write_trace(Trace(Metadata.new("30", "every-frame"), recordings(lengths())), trace)
+        found = engine_lines(arguments.rounds) + kalman_lines(arguments.rounds)
+        found += process_lines(str(trace), arguments.rounds)
+        found += memory_lines(folder, arguments.sequences)
+    print(table(["what", "how", "median", "ratio", "target"], found))
+
+
+if __name__ == "__main__":
+    main()
