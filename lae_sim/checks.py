@@ -173,7 +173,7 @@ def _cause_of_order(frame: int, expected: int) -> str:
     if frame == expected - 1:
         return "the frame is there twice"
     if frame > expected:
-        return f"{frame - expected} frames are missing from frame {expected} on; write every world frame"
+        return f"{frame - expected} missing from frame {expected} on; write every world frame"
     return "rows are not sorted by frame"
 
 
