@@ -153,7 +153,7 @@ def _matched(
         elif name in matched:
             raise LaeError(
                 f"{source.path} and {matched[name].path} are both results of sequence {name!r}; "
-                "give the folder of one tracker"
+                "give the folder or file of one tracker"
             )
         else:
             matched[name] = source
