@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -55,8 +55,8 @@ def curves(
 
 def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Figure:
     """Success and precision plots side by side, AUC and DP at 20 px in the legends."""
-    figure: Figure
-    figure, (left, right) = _pyplot().subplots(1, 2, figsize=(10, 4.2), layout="constrained")
+    figure = _figure(10, 4.2)
+    left, right = figure.subplots(1, 2)
     figure.suptitle(title)
     for name, (success, precision) in named.items():
         style = "--" if name == "offline" else "-"
@@ -84,8 +84,8 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
     schedule = run.schedule
     clock = schedule.clock
     end = min(first + count, schedule.length)
-    figure: Figure
-    figure, axes = _pyplot().subplots(figsize=(12, 3.6), layout="constrained")
+    figure = _figure(12, 3.6)
+    axes = figure.subplots()
     processed = set(schedule.frames.tolist())
     for frame in range(first, end):
         taken = frame in processed
@@ -144,9 +144,10 @@ def save(figure: Figure, path: str) -> None:
         figure.savefig(temporary, format=ending, dpi=150)
 
 
-def _pyplot() -> Any:
+def _figure(width: float, height: float) -> Figure:
+    """An empty figure, of its own: pyplot would keep a list of all."""
     try:
-        import matplotlib.pyplot as pyplot
+        from matplotlib.figure import Figure
     except ImportError as error:
         raise LaeError("pictures need matplotlib: pip install 'lae-sim[plot]'") from error
-    return pyplot
+    return Figure(figsize=(width, height), layout="constrained")
