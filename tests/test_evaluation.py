@@ -270,8 +270,8 @@ def test_a_forecaster_that_answers_nonsense_is_named() -> None:
         evaluate([replay_sequence(moving(9), CLOCK)], EVERY, {"mine": factory})
 
 
-@pytest.mark.parametrize("size", [1e-300, 1e150, 1e300])
-def test_boxes_of_any_finite_size_are_scored_without_a_warning(size: float) -> None:
+@pytest.mark.parametrize("size", [1e-300, 1e-9, 1e9])
+def test_tiny_and_huge_boxes_are_scored_without_a_warning(size: float) -> None:
     boxes = moving(30).boxes * size
     recording = Recording.new("a", boxes, boxes[::-1], [40_000_000] * 30)
     metadata = Metadata.new("30", "every-frame", sequences={"a": {"image_size": [640, 360]}})

@@ -387,9 +387,10 @@ SIGMAS = st.one_of(
 def moving(length: int, seed: int = 0, name: str = "a", elapsed: int = 47_000_000) -> Recording:
     """A recording of a target that walks about, with truth and scores on every frame."""
     random = np.random.default_rng(seed)
-    truth = np.array([200.0, 150, 40, 30]) + np.cumsum(random.normal(0, 4, (length, 4)), axis=0)
+    steps = random.normal(0, [4, 4, 1, 1], (length, 4))
+    truth = np.array([200.0, 150, 40, 30]) + np.cumsum(steps, axis=0)
     truth[:, 2:] = np.clip(truth[:, 2:], 20, 60)
-    boxes = truth + random.normal(0, 2, (length, 4))
+    boxes = truth + random.normal(0, 0.7, (length, 4))
     jitter = random.integers(0, 9_000_000, length)
     return Recording.new(name, truth, boxes, elapsed + jitter, random.random(length))
 

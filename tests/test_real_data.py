@@ -1,0 +1,115 @@
+"""The figures of DESIGN 6, on real trackers; skipped where the data is absent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lae_sim.clock import Clock
+from lae_sim.evaluation import Evaluation, evaluate
+from lae_sim.forecast import load_forecaster
+from lae_sim.latency import by_frame, constant, scaled
+from lae_sim.metadata import Metadata
+from lae_sim.pairing import SIGMA_GRID
+from lae_sim.recording import Recording
+from lae_sim.run import replay_sequence
+from lae_sim.trace import Trace, read_trace, write_trace
+
+METADATA = Metadata.new("30", "every-frame")
+CLOCK = Clock.at(Fraction(30))
+FORECASTERS = {name: load_forecaster(name) for name in ("hold", "kalman")}
+
+
+def stored(recordings: Iterator[Recording], folder: Path) -> Trace:
+    path = folder / "trace.parquet"
+    write_trace(Trace(METADATA, recordings), path)
+    return read_trace(path)
+
+
+@pytest.fixture(scope="module")
+def ortrack(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Trace:
+    dataset = "VisDrone-SOT-test-dev"
+    results = shared_data / "results_with_times" / dataset / "ORTrack-DeiT-tiny"
+
+    def recordings() -> Iterator[Recording]:
+        for path in sorted(results.glob("*_s.txt")):
+            truth = np.loadtxt(shared_data / dataset / "anno" / path.name, delimiter=",")
+            seconds = np.loadtxt(results / f"{path.stem}_time.txt")
+            boxes = np.loadtxt(path, delimiter=",")
+            yield Recording.new(path.stem, truth, boxes, np.rint(seconds * 1e9))
+
+    return stored(recordings(), tmp_path_factory.mktemp("ortrack"))
+
+
+@pytest.fixture(scope="module")
+def nanotrack(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Trace:
+    def recordings() -> Iterator[Recording]:
+        with np.load(shared_data / "results_boxes" / "DTB70" / "NanoTrackV3.npz") as boxes:
+            for name in sorted(boxes.files):
+                truth = np.loadtxt(shared_data / "DTB70" / "anno" / f"{name}.txt", delimiter=",")
+                yield Recording.new(name, truth, boxes[name], np.full(len(truth), 47_000_000))
+
+    return stored(recordings(), tmp_path_factory.mktemp("nanotrack"))
+
+
+def means(found: Evaluation) -> dict[str, tuple[float, float]]:
+    """AUC and DP of each forecaster, over sequences and then sigmas, to four decimals."""
+    auc, dp = (found.scores[metric].mean(axis=(1, 2)) for metric in ("auc", "dp20"))
+    return {name: (round(a, 4), round(d, 4)) for name, a, d in zip(FORECASTERS, auc, dp)}
+
+
+@pytest.mark.parametrize(
+    ("factor", "processed", "mismatch", "hold", "kalman"),
+    [
+        (1, 19_427, 20_351, (0.5013, 0.6930), (0.5063, 0.7137)),
+        (2, 15_401, 47_022, (0.4772, 0.6624), (0.4929, 0.7025)),
+        (4, 7_742, 85_214, (0.4477, 0.6523), (0.4682, 0.6838)),
+    ],
+)
+def test_ortrack_on_visdrone(
+    ortrack: Trace,
+    factor: int,
+    processed: int,
+    mismatch: int,
+    hold: tuple[float, float],
+    kalman: tuple[float, float],
+) -> None:
+    source = scaled(by_frame, Fraction(factor))
+    runs = [replay_sequence(recording, CLOCK, source) for recording in ortrack]
+    found = evaluate(runs, METADATA, FORECASTERS)
+    assert len(found.sequences) == 20
+    assert found.frames.sum() == 19_433
+    assert found.processed.sum() == processed
+    assert found.mismatch_sum.sum() == mismatch
+    assert means(found) == {"hold": hold, "kalman": kalman}
+    assert found.offline["auc"].mean().round(4) == 0.5147
+    assert found.offline["dp20"].mean().round(4) == 0.7189
+
+
+def test_nanotrack_on_dtb70_at_47_ms(nanotrack: Trace) -> None:
+    runs = [replay_sequence(recording, CLOCK) for recording in nanotrack]
+    found = evaluate(runs, METADATA, FORECASTERS)
+    assert len(found.sequences) == 70
+    assert found.processed.sum() == 11_226
+    assert found.mismatch_sum.sum() == 40_315
+    assert means(found) == {"hold": (0.4233, 0.5566), "kalman": (0.5300, 0.7221)}
+    assert found.offline["auc"].mean().round(3) == 0.628
+    assert found.offline["dp20"].mean().round(3) == 0.815
+
+
+def test_nanotrack_over_the_grid_of_permitted_latencies(nanotrack: Trace) -> None:
+    source = constant(47_000_000)
+    runs = [replay_sequence(recording, CLOCK, source) for recording in nanotrack]
+    found = evaluate(runs, METADATA, FORECASTERS, SIGMA_GRID)
+    assert means(found) == {"hold": (0.4560, 0.6086), "kalman": (0.5485, 0.7475)}
+
+
+def test_offline_values_do_not_depend_on_latency(nanotrack: Trace) -> None:
+    runs = [replay_sequence(r, CLOCK, constant(0)) for r in list(nanotrack)[:5]]
+    found = evaluate(runs, METADATA, FORECASTERS)
+    for metric, offline in found.offline.items():
+        assert found.scores[metric][0, :, 0].tolist() == offline.tolist()
