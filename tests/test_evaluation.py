@@ -70,7 +70,7 @@ def plain_truth(recording: Recording) -> list[list[float] | None]:
 
 
 @given(groups(), SIGMAS, st.sampled_from(list(CONVENTIONS)))
-@settings(max_examples=80)
+@settings(max_examples=45)
 def test_scores_agree_with_plain_loops_over_the_oracle(
     group: tuple[Fraction, list[Recording]], sigmas: list[Fraction], name: str
 ) -> None:
@@ -133,7 +133,7 @@ def test_evaluation_agrees_with_the_event_driven_world(
 
 
 @given(groups(), st.booleans())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_the_grid_is_its_sigmas_one_by_one_and_groups_are_their_sequences(
     group: tuple[Fraction, list[Recording]], at_arrival: bool
 ) -> None:

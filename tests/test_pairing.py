@@ -45,7 +45,7 @@ def several_worlds(draw: st.DrawFn) -> list[World]:
 
 
 @given(several_worlds(), SIGMAS)
-@settings(max_examples=60)
+@settings(max_examples=50)
 def test_pairing_agrees_with_the_fractions(group: list[World], sigmas: list[Fraction]) -> None:
     pairing = pair([schedule_of(world) for world in group], sigmas)
     for s, (fps, elapsed, _) in enumerate(group):
@@ -98,6 +98,7 @@ def test_histories_and_pairs_list_each_fed_output_and_each_pair(
 
 
 @given(worlds(), SIGMAS)
+@settings(max_examples=30)
 def test_at_arrival_latency_plays_no_part(world: World, sigmas: list[Fraction]) -> None:
     schedule = schedule_of(world)
     pairing = pair([schedule], sigmas, at_arrival=True)
@@ -162,6 +163,14 @@ def test_the_grid_of_pvt_plus_plus() -> None:
     assert SIGMA_GRID[:2] == (0, Fraction(2, 100))
     assert SIGMA_GRID[-1] == 1
     assert len(SIGMA_GRID) == 51
+
+
+@pytest.mark.parametrize("years", [1, 9, 69, 200])
+@pytest.mark.parametrize("sigma", [Fraction(-5), Fraction(0), Fraction(1, 50), Fraction(1000)])
+def test_an_output_that_is_ready_years_later_answers_nothing(years: int, sigma: Fraction) -> None:
+    clock = Clock.at(Fraction(1))
+    late = simulate(9, clock, lambda frame: years * 31_536_000 * 10**9 if frame else 0, latest)
+    assert psis(pair([late], [sigma]), 0, 0) == [0] * 9
 
 
 @pytest.mark.parametrize(

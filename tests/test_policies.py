@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from witness import RATES, SECOND, times
 
 from lae_sim.clock import Clock
-from lae_sim.engine import Call, Policy, simulate
+from lae_sim.engine import Policy, simulate
 from lae_sim.errors import LaeError
 from lae_sim.policies import every, fifo, latest, shrinking_tail, vot_realtime
 
@@ -92,7 +92,7 @@ def tail(t: Fraction) -> Fraction:
 def test_shrinking_tail_waits_iff_the_tail_shrinks(data: st.DataObject, fps: Fraction) -> None:
     ready_ns, expected_ns = data.draw(times(fps, 2))
     clock = Clock.at(fps)
-    call = Call(0, 0, ready_ns * clock.ticks_per_ns)
+    call = (0, 0, ready_ns * clock.ticks_per_ns)
     frame, start = shrinking_tail(expected_ns)(clock, [call])
     s, r = ready_ns * fps / SECOND, expected_ns * fps / SECOND  # in frames
     waits = r > 1 and tail(s + r) < tail(s)
