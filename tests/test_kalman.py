@@ -116,6 +116,10 @@ def test_a_restart_needs_an_iou_strictly_below_0_3() -> None:
     lost.update(1, [0, 7.0625, 10, 13])
     assert kept.predict(2)[1] > 7  # it moves on
     assert lost.predict(2) == [0, 7.0625, 10, 13]  # zero velocity
+    for shift, restarts in ((7, False), (7.0625, True)):
+        boxes = np.array([[0, 0, 10, 13], [0, shift, 10, 13]], float)
+        lanes = Lanes(np.array([0, 2]), np.array([0, 1]), boxes, np.full((1, 2), np.inf))
+        assert (KalmanLaePvt.run_lanes(lanes).velocity[1] == 0).all() == restarts
     for wanted, restarts in ((0.29, True), (0.31, False)):
         model = KalmanLaePvt([0, 0, 100, 100])
         model.update(1, iou_case(wanted))

@@ -277,11 +277,36 @@ def test_the_centre_of_pysot() -> None:
     assert centre(np.array([[10.0, 20, 5, 6]])).tolist() == [[12, 22.5]]
 
 
+@pytest.mark.parametrize("truth", [[-9.5, 10, 20, 20], [10, -9.5, 20, 20]])
+def test_a_centre_of_0_is_not_above_0(truth: list[float]) -> None:
+    far = [[500.0, 500, 20, 20]]
+    assert offline([truth], far, "pysot")["dp20"] == 1  # invalid: a hit
+    moved = [v + 0.125 if v < 0 else v for v in truth]
+    assert offline([moved], far, "pysot")["dp20"] == 0
+
+
+def test_a_normalised_error_of_0_20_is_a_hit() -> None:
+    truth = [[100.0, 100, 20, 20]]
+    assert offline(truth, [[104.0, 100, 20, 20]], "pysot")["norm_dp20"] == 1
+    assert offline(truth, [[100.0, 104.125, 20, 20]], "pysot")["norm_dp20"] == 0
+
+
 def test_thresholds_are_strict_for_success_and_not_for_precision() -> None:
     truth, half = np.array([[0.0, 0, 20, 20]]), np.array([[0.0, 0, 20, 10]])
     counts = frame_counts(truth, half, np.array([0]), PYSOT)
     assert counts.success.item() == 10  # 0, 0.05, ..., 0.45
     assert success_curve(truth, half, PYSOT).tolist() == [1.0] * 10 + [0.0] * 11
+
+
+@EVERY
+@pytest.mark.parametrize("side", [1e-9, 1e-200, 5e-324])
+def test_a_truth_of_almost_no_size_is_a_miss_of_normalised_precision(
+    name: str, side: float
+) -> None:
+    truth = [[100.0, 100, 20, 20], [100.0, 100, side, side]]
+    found = offline(truth, [[100.0, 100, 20, 20], [100.0, 100, 20, 20]], name)
+    assert found["norm_auc"] == found["norm_dp20"] == 0.5
+    assert found["dp20"] == 1
 
 
 def test_an_unknown_convention_is_refused() -> None:

@@ -68,7 +68,9 @@ def test_values_come_back_bit_for_bit(path: Path, group: list[Recording]) -> Non
 def test_extreme_values_come_back_bit_for_bit(path: Path) -> None:
     tiny, huge = 5e-324, 123456789.123456789
     boxes = [[-0.0, 0.0, tiny, 1.0], [huge, -huge, 2.0, 3.0], [0.1, 1 / 3, 2**29 + 2**-23, 1e9]]
-    recording = Recording.new("a", [[1, 1, 1, 1]] * 3, boxes, [0, 2**63 - 1, 1], [0, -1e-45, 3e38])
+    recording = Recording.new(
+        "a", [[1, 1, 1, 1]] * 3, boxes, [0, 2**63 - 1, 1], [-70, -1e-45, 3e38]
+    )
     write_trace(Trace(EVERY, [recording]), path)
     assert_same(read_trace(path), [recording])
 
@@ -362,6 +364,7 @@ def test_a_faulty_recording_is_not_written(tmp_path: Path, path: Path) -> None:
         [Recording.new("a", np.ones((2, 4)), [[1, 2, 3, np.nan]] * 2, [0, 0])],
         [Recording.new("a", np.ones((2, 4)), np.ones((2, 4)), [0, -7])],
         [Recording.new("a", np.ones((2, 4)), np.ones((2, 4)), [-1, 7])],
+        [Recording.new("a", np.ones((2, 4)), [[1, 2, 3, 4], [np.nan] * 4], [0, -7])],
         [Recording.new("a", np.ones((2, 4)), np.ones((2, 4)), [47, 46])],
     ):
         with pytest.raises(TraceError, match=r"trace.parquet: column"):
