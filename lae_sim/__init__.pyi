@@ -3,13 +3,7 @@ from .engine import Call, Policy, Schedule, Service, simulate
 from .errors import LaeError, TraceError
 from .evaluation import Answers, Evaluation, answers, evaluate
 from .events import Event, event_log
-from .forecast import (
-    ConstantVelocity,
-    Forecaster,
-    ForecasterFactory,
-    Hold,
-    load_forecaster,
-)
+from .forecast import ConstantVelocity, Forecaster, ForecasterFactory, Hold
 from .kalman import Kalman, KalmanLaePvt
 from .latency import (
     LatencySource,
@@ -22,6 +16,7 @@ from .latency import (
 )
 from .metadata import Metadata
 from .metrics import CONVENTIONS, Convention, precision_curve, success_curve
+from .options import load_forecaster
 from .pairing import SIGMA_GRID, Pairing, pair
 from .policies import every, fifo, latest, shrinking_tail, vot_realtime
 from .recording import Recording

@@ -13,11 +13,8 @@ The class itself is the factory; name it ``package.module:MyForecaster`` on the 
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Optional, Protocol, runtime_checkable
 
 import numpy as np
@@ -133,44 +130,6 @@ class ConstantVelocity:
         velocity[1:] = np.diff(lanes.boxes, axis=0) / interval[:, None]
         velocity[lanes.offsets[:-1]] = 0.0
         return Motion(lanes.boxes, velocity)
-
-
-def load_forecaster(name: str) -> ForecasterFactory:
-    """A forecaster by its name, or a user's own as ``package.module:factory``.
-
-    Modules are also looked for in the current folder.
-
-    Raises:
-        LaeError: if there is none of that name, or it cannot be imported.
-    """
-    from lae_sim.kalman import Kalman, KalmanLaePvt
-
-    built_in: dict[str, ForecasterFactory] = {
-        "hold": Hold,
-        "constant-velocity": ConstantVelocity,
-        "kalman": Kalman,
-        "kalman-lae-pvt": KalmanLaePvt,
-    }
-    if name in built_in:
-        return built_in[name]
-    module_name, colon, attribute = name.partition(":")
-    if not colon:
-        raise LaeError(
-            f"no forecaster {name!r}: there are {', '.join(built_in)}, and package.module:factory"
-        )
-    here = str(Path.cwd())
-    sys.path.insert(0, here)
-    try:
-        factory: Any = importlib.import_module(module_name)
-        for part in attribute.split("."):
-            factory = getattr(factory, part)
-    except Exception as error:  # a user's module may fail in any way while it is imported
-        raise LaeError(f"forecaster {name!r}: {type(error).__name__}: {error}") from error
-    finally:
-        sys.path.remove(here)
-    if not callable(factory):
-        raise LaeError(f"forecaster {name!r} is not callable")
-    return factory  # type: ignore[no-any-return]
 
 
 def forecast(

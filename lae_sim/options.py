@@ -1,14 +1,18 @@
-"""Policies and latency sources by the names that command lines use."""
+"""Policies, latency sources and forecasters by the names that command lines use."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import importlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from lae_sim.clock import parse_duration
 from lae_sim.errors import LaeError
 
 if TYPE_CHECKING:
     from lae_sim.engine import Policy
+    from lae_sim.forecast import ForecasterFactory
     from lae_sim.latency import LatencySource
 
 
@@ -60,6 +64,45 @@ def parse_latency(text: str) -> LatencySource:
         f"no latency {text!r}: there are recorded, by-call, constant:47ms, resample:SEED, "
         "lognormal:SEED"
     )
+
+
+def load_forecaster(name: str) -> ForecasterFactory:
+    """A forecaster by its name, or a user's own as ``package.module:factory``.
+
+    Modules are also looked for in the current folder.
+
+    Raises:
+        LaeError: if there is none of that name, or it cannot be imported.
+    """
+    from lae_sim.forecast import ConstantVelocity, Hold
+    from lae_sim.kalman import Kalman, KalmanLaePvt
+
+    built_in: dict[str, ForecasterFactory] = {
+        "hold": Hold,
+        "constant-velocity": ConstantVelocity,
+        "kalman": Kalman,
+        "kalman-lae-pvt": KalmanLaePvt,
+    }
+    if name in built_in:
+        return built_in[name]
+    module_name, colon, attribute = name.partition(":")
+    if not colon:
+        raise LaeError(
+            f"no forecaster {name!r}: there are {', '.join(built_in)}, and package.module:factory"
+        )
+    here = str(Path.cwd())
+    sys.path.insert(0, here)
+    try:
+        factory: Any = importlib.import_module(module_name)
+        for part in attribute.split("."):
+            factory = getattr(factory, part)
+    except Exception as error:  # a user's module may fail in any way while it is imported
+        raise LaeError(f"forecaster {name!r}: {type(error).__name__}: {error}") from error
+    finally:
+        sys.path.remove(here)
+    if not callable(factory):
+        raise LaeError(f"forecaster {name!r} is not callable")
+    return factory  # type: ignore[no-any-return]
 
 
 def _whole(text: str, value: str, least: int = 0) -> int:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from lae_sim.cli import argument, exit_status
 from lae_sim.clock import parse_fps, parse_rational
 from lae_sim.errors import LaeError
-from lae_sim.options import parse_latency, parse_policy
+from lae_sim.options import load_forecaster, parse_latency, parse_policy
 
 if TYPE_CHECKING:
     from lae_sim.clock import Clock
@@ -168,7 +168,6 @@ class _Job:
     @classmethod
     def of(cls, path: str, arguments: argparse.Namespace, sigmas: Sequence[Fraction]) -> _Job:
         from lae_sim.clock import Clock
-        from lae_sim.forecast import load_forecaster
         from lae_sim.latency import scaled
         from lae_sim.metrics import find_convention
         from lae_sim.run import replay_trace

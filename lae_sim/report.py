@@ -169,7 +169,7 @@ def summary_table(reports: Sequence[Report], shown_sigmas: Sequence[float]) -> s
     grid = any("mauc" in result for report in reports for result in report["results"])
     header = ["trace", "forecaster"]
     header += ["sigma"] if len(shown_sigmas) > 1 or shown_sigmas != [0.0] else []
-    header += ["AUC", "offline", "change", "recovered", "DP@20", "offline", "change", "recovered"]
+    header += ["AUC", "offline", "change", "recov.", "DP@20", "offline", "change", "recov."]
     header += ["mAUC", "mDP"] if grid else []
     header += ["tracker", "skipped", "mismatch"]
     lines = []
@@ -216,7 +216,7 @@ def settings_text(report: Report) -> str:
     else:
         lines.append(
             f"  approximate: {report['approximate_outputs']:,} outputs "
-            f"({100 * report['approximate_share']:.3g} %) follow another frame than when recorded; "
+            f"({100 * report['approximate_share']:.3g}%) follow another frame than when recorded; "
             "a stateful\n  tracker would have seen larger motion there, so this is optimistic"
         )
     return "\n".join(lines)
@@ -276,8 +276,8 @@ def _score(value: float | None) -> str:
 
 
 def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f} %"
+    return "-" if value is None else f"{100 * value:.1f}%"
 
 
 def _change(value: float | None, offline: float | None) -> str:
-    return "-" if value is None or not offline else f"{100 * (value / offline - 1):+.1f} %"
+    return "-" if value is None or not offline else f"{100 * (value / offline - 1):+.1f}%"

@@ -10,7 +10,7 @@ import scipy.io
 from lae_sim.clock import Clock
 from lae_sim.convert import main
 from lae_sim.evaluation import evaluate
-from lae_sim.forecast import load_forecaster
+from lae_sim.options import load_forecaster
 from lae_sim.run import replay_sequence
 from lae_sim.trace import read_trace
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lae_sim.errors import LaeError
-from lae_sim.forecast import (
-    ConstantVelocity,
-    Hold,
-    Lanes,
-    forecast,
-    load_forecaster,
-)
+from lae_sim.forecast import ConstantVelocity, Hold, Lanes, forecast
 from lae_sim.kalman import Kalman, KalmanLaePvt
 
 BUILT_IN = {
@@ -167,56 +160,3 @@ def test_an_answer_that_is_no_box_is_refused(answer: Any) -> None:
 def test_any_four_numbers_are_a_box(answer: Any) -> None:
     factory = type("Fine", (Answers,), {"answer": answer})
     assert forecast(factory, TWO, ITEM, FRAME).tolist() == [[1, 2, 3, 4]] * 3
-
-
-# ------------------------------------------------------------------------------------ by name
-
-
-@pytest.mark.parametrize(("name", "factory"), BUILT_IN.items())
-def test_built_in_names(name: str, factory: Any) -> None:
-    assert load_forecaster(name) is factory
-
-
-def test_a_forecaster_of_an_installed_module() -> None:
-    assert load_forecaster("lae_sim.kalman:Kalman") is Kalman
-    assert load_forecaster("lae_sim.kalman:Kalman.__init__") is Kalman.__init__
-
-
-def test_a_forecaster_of_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "my_forecasters_of_a_test.py").write_text("def make(box, size): ...\n")
-    monkeypatch.chdir(tmp_path)
-    factory = load_forecaster("my_forecasters_of_a_test:make")
-    assert factory.__name__ == "make"
-    import sys
-
-    assert str(tmp_path) not in sys.path
-    monkeypatch.delitem(sys.modules, "my_forecasters_of_a_test")
-
-
-@pytest.mark.parametrize(
-    ("name", "problem"),
-    [
-        ("kalmann", "no forecaster 'kalmann': there are hold, constant-velocity, kalman"),
-        ("", "no forecaster ''"),
-        ("no_such_module_here:x", "ModuleNotFoundError"),
-        ("lae_sim.kalman:NoSuch", "AttributeError"),
-        ("lae_sim.kalman:", "AttributeError"),
-        (":Kalman", "ValueError"),
-        ("lae_sim.kalman:RESTART_IOU", "not callable"),
-        ("lae_sim.kalman:Kalman:update", "AttributeError"),
-    ],
-)
-def test_a_wrong_name_says_what_is_wrong(name: str, problem: str) -> None:
-    with pytest.raises(LaeError, match=problem):
-        load_forecaster(name)
-
-
-def test_a_module_that_fails_while_it_is_imported_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "failing_of_a_test.py").write_text("1 / 0\n")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(LaeError, match="ZeroDivisionError: division by zero"):
-        load_forecaster("failing_of_a_test:make")

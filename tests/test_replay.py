@@ -92,7 +92,7 @@ def test_the_table_has_a_line_for_each_trace_and_forecaster():
         for forecaster in ("hold", "constant-velocity", "kalman")
     ]
     assert "convention pysot, policy latest, latency recorded" in text
-    assert "approximate: 637 outputs (38.2 %)" in text
+    assert "approximate: 637 outputs (38.2%)" in text
     assert "times: synthetic" in text
 
 
