@@ -13,10 +13,10 @@ from fractions import Fraction
 from lae_sim.errors import LaeError
 
 NS_PER_SECOND = 10**9
-MAX_TICKS = 2**63 - 1
+MAX_INT64 = 2**63 - 1
 
-_DECIMAL = r"\d{1,12}(?:\.\d{1,12})?"
-_RATIONAL = re.compile(rf"(?:{_DECIMAL}|\d{{1,12}}/\d{{1,12}})\Z")
+_DECIMAL = r"[0-9]{1,12}(?:\.[0-9]{1,12})?"
+_RATIONAL = re.compile(rf"(?:{_DECIMAL}|[0-9]{{1,12}}/[0-9]{{1,12}})\Z")
 _DURATION = re.compile(rf"({_DECIMAL})(ns|us|ms|s)\Z")
 _UNIT_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": NS_PER_SECOND}
 

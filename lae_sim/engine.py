@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from itertools import chain
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import simpy
 
-from lae_sim.clock import MAX_TICKS, Clock
+from lae_sim.clock import Clock
 from lae_sim.errors import LaeError
 
 Ints = npt.NDArray[np.int64]
@@ -78,13 +79,14 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
     environment = simpy.Environment()
     environment.process(_tracker(environment, length, clock, service, policy, calls))
     environment.run()
-    frame, _, ready = calls[-1]
-    if ready > MAX_TICKS:
+    try:
+        flat = np.fromiter(chain.from_iterable(calls), np.int64, 3 * len(calls))
+    except OverflowError as error:
+        frame, _, ready = max(calls, key=itemgetter(2))
         raise LaeError(
             f"the output of frame {frame} is ready at tick {ready}, beyond 64 bits: "
             f"check the processing times, or write the frame rate {clock.fps} more simply"
-        )
-    flat = np.fromiter(chain.from_iterable(calls), np.int64, 3 * len(calls))
+        ) from error
     return Schedule(clock, length, *flat.reshape(-1, 3).T.copy())
 
 

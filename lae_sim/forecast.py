@@ -171,8 +171,14 @@ def forecast(
         while fed < i:
             fed += 1
             forecaster.update(int(lanes.frames[fed]), lanes.boxes[fed].tolist())
-        answer = np.asarray(forecaster.predict(int(frame[p])), np.float64)
+        told = forecaster.predict(int(frame[p]))
+        try:
+            answer = np.asarray(told, np.float64)
+        except (TypeError, ValueError, OverflowError):
+            answer = np.array(np.nan)
         if answer.shape != (4,) or not np.isfinite(answer).all():
-            raise LaeError(f"{name}: predicted {answer} for frame {frame[p]}, not a box x, y, w, h")
+            raise LaeError(
+                f"{name}: predicted {told!r:.80} for frame {frame[p]}, not a box x, y, w, h"
+            )
         answers[p] = answer
     return answers

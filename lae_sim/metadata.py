@@ -59,7 +59,9 @@ class Metadata:
             TraceError: if it is not JSON, not of this format, or of a newer major version.
         """
         try:
-            document = json.loads(text.decode(), parse_constant=_refuse_constant)
+            document = json.loads(
+                text.decode(), parse_constant=_refuse_constant, parse_float=_finite
+            )
         except (ValueError, RecursionError) as error:
             raise TraceError(f"metadata 'lae_sim' is not valid JSON: {error}") from error
         if not isinstance(document, dict):
@@ -67,7 +69,7 @@ class Metadata:
         if document.get("format") != FORMAT:
             raise TraceError(f"metadata key 'format' must be {FORMAT!r}")
         version = document.get("version")
-        if not isinstance(version, str) or not re.match(r"\d{1,6}\.\d{1,6}\Z", version):
+        if not isinstance(version, str) or not re.match(r"[0-9]{1,6}\.[0-9]{1,6}\Z", version):
             raise TraceError("metadata key 'version' must be text such as '1.0'")
         if int(version.split(".")[0]) != 1:
             raise TraceError(
@@ -108,6 +110,13 @@ class Metadata:
     def _sequence(self, sequence: str) -> Mapping[str, Any]:
         found: Mapping[str, Any] = self.document.get("sequences", {}).get(sequence, {})
         return found
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if value in (float("inf"), float("-inf")):
+        raise ValueError(f"{text[:40]} is too large")
+    return value
 
 
 def _refuse_constant(name: str) -> None:

@@ -142,7 +142,8 @@ def frame_counts(
     invalid_error = np.inf if convention.leaves_out else -1.0
     error = np.where(valid_centre, _length(offset), invalid_error)
     sized = np.where(truth[:, 2:] > 0, truth[:, 2:], np.nan)
-    norm_error = np.where(valid_centre, _length(offset / sized), invalid_error)
+    with np.errstate(over="ignore"):  # a truth of almost no size: an infinite error is a miss
+        norm_error = np.where(valid_centre, _length(offset / sized), invalid_error)
     norm_error = np.where(np.isnan(norm_error), np.inf, norm_error)
     return FrameCounts(
         success=success,
@@ -172,7 +173,7 @@ def success_curve(truth: Floats, answers: Floats, convention: Convention) -> Flo
     counts = frame_counts(truth, answers, np.arange(len(truth)), convention)
     scored = convention.valid_success(truth) if convention.leaves_out else np.ones(len(truth), bool)
     passed = counts.success[scored, None] > np.arange(convention.thresholds)
-    curve: Floats = passed.mean(axis=0)
+    curve: Floats = passed.sum(axis=0) / (scored.sum() or np.nan)
     return curve
 
 
@@ -188,5 +189,5 @@ def precision_curve(truth: Floats, answers: Floats, convention: Convention) -> F
     error = np.where(valid, _length(centre(answers) - centre(truth)), -1.0)
     if convention.leaves_out:
         error = error[valid]
-    curve: Floats = (error[:, None] <= CENTRE_THRESHOLDS).mean(axis=0)
+    curve: Floats = (error[:, None] <= CENTRE_THRESHOLDS).sum(axis=0) / (len(error) or np.nan)
     return curve

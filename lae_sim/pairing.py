@@ -91,8 +91,11 @@ def pair(
             latency then plays no part.
 
     Raises:
-        LaeError: if a sigma is too fine or too large for 64-bit integers.
+        LaeError: if the sigmas are not ascending, or too fine or too large for 64-bit integers, or
+            the outputs are not ready in order.
     """
+    if list(sigmas) != sorted(set(sigmas)):
+        raise LaeError("permitted latencies must be ascending, each of them once")
     scale = lcm(*(sigma.denominator for sigma in sigmas))
     numerators = [int(sigma * scale) for sigma in sigmas]
     interval = schedules[0].clock.frame_ticks
@@ -110,6 +113,11 @@ def pair(
     frames = np.concatenate([schedule.frames for schedule in schedules])
     if at_arrival:
         steps = frames * scale
+    elif any((np.diff(schedule.ready) < 0).any() for schedule in schedules):
+        raise LaeError(
+            "an output is ready before that of an older frame, as under the rule of VOT: score "
+            "such a schedule at arrival"
+        )
     else:
         frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]), interval)
         steps = frame * scale - (-rest * scale // interval)

@@ -72,6 +72,7 @@ class Rows:
         column = dict(zip(batch.schema.names, batch.columns))
         indices = column["sequence"].indices
         dictionary = [*column["sequence"].dictionary.to_pylist(), ""]
+        column["sequence"].validate(full=True)
         codes = np.where(is_null(indices), len(dictionary) - 1, to_numpy(indices, np.int32))
         edges = np.flatnonzero(np.diff(codes)) + 1
         starts = np.concatenate([[0], edges, [len(codes)]])

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim.boxes import Floats
-from lae_sim.clock import MAX_TICKS
+from lae_sim.clock import MAX_INT64
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
 
@@ -94,7 +94,7 @@ def read_durations(path: Path, unit: str | None = None, column: int = 0) -> Ints
         if not _NUMBER.match(cell) or cell.startswith("-"):
             raise LaeError(f"{path}, line {number}: {cell[:40]!r} is not a processing time")
         times.append(round(Fraction(cell) * scale))
-        if times[-1] > MAX_TICKS:
+        if times[-1] > MAX_INT64:
             raise LaeError(f"{path}, line {number}: {cell[:40]} {unit or 's'} is too long a time")
     if unit is None:
         check_seconds(times, str(path))

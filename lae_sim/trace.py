@@ -101,10 +101,16 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
             write_page_checksum=True,
         ) as writer,
     ):
+        group: list[Recording] = []
         for group in batched(trace):
+            for recording in group:
+                if not len(recording):
+                    raise TraceError(f"{path}: sequence {recording.name!r} has no frames")
             rows = Rows.of_recordings(group)
             check(rows)
             writer.write_batch(rows.to_batch(schema))
+        if not group:
+            raise TraceError(f"{path}: the trace is empty")
 
 
 def batched(items: Iterable[Item], frames: int = BATCH_ROWS) -> Iterator[list[Item]]:
@@ -170,6 +176,9 @@ class _StoredRecordings:
     def _rows(self) -> Iterator[Rows]:
         with self._opened() as file:
             present = [name for name in COLUMN_TYPES if name in file.schema_arrow.names]
+            groups = (file.metadata.row_group(g) for g in range(file.num_row_groups))
+            if sum(group.num_rows for group in groups) != file.metadata.num_rows:
+                raise TraceError(f"{self.path}: the file is damaged: its row counts disagree")
             batches = file.iter_batches(BATCH_ROWS, columns=present, use_threads=False)
             for batch in batches:
                 if batch.num_rows:
@@ -190,6 +199,10 @@ class _StoredRecordings:
                 yield file
         except FileNotFoundError as error:
             raise TraceError(f"{self.path}: no such file") from error
+        except KeyError as error:  # from read_dictionary
+            raise TraceError(
+                f"{self.path}: column 'sequence' is missing: is this a lae_sim trace?"
+            ) from error
         except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
             raise TraceError(f"{self.path}: not a readable Parquet file: {error}") from error
 
