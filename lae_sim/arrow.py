@@ -12,6 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 
+def checksums(option: str) -> dict[str, bool]:
+    """The option that writes or checks page checksums, where pyarrow has it (15 and newer)."""
+    import pyarrow as pa
+
+    return {option: True} if int(pa.__version__.split(".")[0]) >= 15 else {}
+
+
 def from_numpy(values: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = None) -> Any:
     """An Arrow array of one-dimensional numbers; null where ``valid`` is false."""
     import pyarrow as pa

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from lae_sim.arrow import checksums
 from lae_sim.checks import COLUMN_TYPES, RowChecker, check_schema
 from lae_sim.errors import LaeError, TraceError
 from lae_sim.files import written_whole
@@ -98,7 +99,7 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
                 "frame": "DELTA_BINARY_PACKED",
                 "elapsed_ns": "DELTA_BINARY_PACKED",
             },
-            write_page_checksum=True,
+            **checksums("write_page_checksum"),
         ) as writer,
     ):
         group: list[Recording] = []
@@ -194,7 +195,7 @@ class _StoredRecordings:
                 self.path,
                 read_dictionary=["sequence"],
                 pre_buffer=False,
-                page_checksum_verification=True,
+                **checksums("page_checksum_verification"),
             ) as file:
                 yield file
         except FileNotFoundError as error:

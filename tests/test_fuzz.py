@@ -31,6 +31,7 @@ from lae_sim.recording import Recording
 from lae_sim.run import replay_sequence
 from lae_sim.trace import Trace, read_trace, write_trace
 
+OLD_ARROW = int(pa.__version__.split(".")[0]) < 15
 FORECASTERS = {"hold": Hold, "kalman": Kalman, "kalman-lae-pvt": KalmanLaePvt}
 
 Found = tuple[Metadata, list[Recording]]
@@ -101,6 +102,7 @@ def flipped(content: bytes, bits: list[int]) -> bytes:
     return bytes(damaged)
 
 
+@pytest.mark.skipif(OLD_ARROW, reason="pages have no checksums before pyarrow 15")
 def test_a_flipped_bit_of_the_data_is_found_or_changes_nothing(
     tmp_path: Path, content: bytes, original: Found
 ) -> None:
@@ -335,7 +337,7 @@ TYPE_POOL = [
     pa.bool_(),
     pa.int8(),
     pa.uint64(),
-    pa.float16(),
+    pytest.param(pa.float16(), marks=pytest.mark.skipif(OLD_ARROW, reason="needs pyarrow 15")),
     pa.float64(),
     pa.string(),
     pa.large_string(),
