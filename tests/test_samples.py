@@ -1,6 +1,7 @@
 """What ships in ``traces/``: samples, cases, schema, and the example in the format's text."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -50,7 +51,9 @@ def test_samples_are_small_and_say_that_they_are_synthetic():
 
 
 def test_the_generator_makes_the_samples(tmp_path):
-    subprocess.run([sys.executable, TRACES / "make_samples.py", tmp_path], check=True)
+    environment = {**os.environ, "PYTHONPATH": str(TRACES.parent)}
+    command = [sys.executable, TRACES / "make_samples.py", tmp_path]
+    subprocess.run(command, check=True, env=environment)
     assert sorted(path.name for path in tmp_path.iterdir()) == [path.name for path in SAMPLES]
     for path in SAMPLES:
         assert_same_recordings(tmp_path / path.name, path, tolerance=0.011)
