@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test lint bench samples clean
 
 demo: $(VENV)/.demo  ## replay the sample traces
-	$(BIN)/lae-sim replay traces/synthetic-slow.parquet traces/synthetic-fast.parquet --sigma-grid
+	$(BIN)/lae-sim replay traces/synthetic-slow.parquet traces/synthetic-fast.parquet
 
 test: $(VENV)/.test  ## run the tests
 	$(BIN)/python -m pytest -n auto

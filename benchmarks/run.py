@@ -106,6 +106,18 @@ def plain_loop(length: int) -> list[tuple[int, int, int]]:
             return calls
 
 
+def timeouts_alone(count: int) -> None:
+    """SimPy's own cost: a process that does nothing but wait, as often as the engine does."""
+    environment = simpy.Environment()
+
+    def wait() -> Iterator[simpy.Event]:
+        for _ in range(count):
+            yield environment.timeout(1)
+
+    environment.process(wait())
+    environment.run()
+
+
 def camera_and_queries(length: int) -> list[tuple[int, int]]:
     """The plain event-driven design: a camera, a tracker and a query process, an event each."""
     environment = simpy.Environment()
@@ -146,10 +158,12 @@ def engine_lines(rounds: int) -> list[list[str]]:
     """The engine against its floor and the plain event-driven design, per world frame."""
     sizes = lengths().tolist()
     service = constant(ELAPSED_NS)(None)  # type: ignore[arg-type]  # it asks nothing of a recording
+    timeouts = [len(plain_loop(size)) for size in sizes]
     found = medians(
         {
             "engine": lambda: [simulate(size, CLOCK, service, latest) for size in sizes],
-            "plain loop": lambda: [plain_loop(size) for size in sizes],
+            "plain loop, no SimPy": lambda: [plain_loop(size) for size in sizes],
+            "SimPy alone, as many timeouts": lambda: [timeouts_alone(n) for n in timeouts],
             "camera + query processes": lambda: [camera_and_queries(size) for size in sizes],
         },
         rounds,
