@@ -226,8 +226,23 @@ def _report(
         "latency": arguments.latency,
         "latency_scale": str(arguments.latency_scale),
         "convention": job.convention.name,
+        "notes": _notes(job, evaluation.sequences),
         **figures,
     }
+
+
+def _notes(job: _Job, sequences: Sequence[str]) -> list[str]:
+    """What keeps the figures from being what their names promise."""
+    notes = []
+    if job.at_arrival:
+        notes.append("vot-realtime skips frames but never scores latency")
+    unknown = sum(job.trace.metadata.image_size(name) is None for name in sequences)
+    if unknown and "kalman-lae-pvt" in job.forecasters:
+        notes.append(
+            f"kalman-lae-pvt does not clip forecasts where the image size is unknown, as it is of "
+            f"{unknown} of {len(sequences)} sequences"
+        )
+    return notes
 
 
 def _sinks(

@@ -209,8 +209,7 @@ def settings_text(report: Report) -> str:
     ]
     if report["times_note"] is not None:
         lines.append(f"  times: {report['times_note']}")
-    if report["policy"].startswith("vot-realtime"):
-        lines.append("  vot-realtime skips frames but never scores latency")
+    lines += [f"  {note}" for note in report["notes"]]
     if report["exact"]:
         lines.append("  exact: every output follows the same frame as when it was recorded")
     else:

@@ -317,6 +317,19 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(arguments, words, tmp_pa
     assert leftovers == []
 
 
+def test_what_a_figure_is_not_is_said(tmp_path):
+    trace = lae_sim.read_trace(SLOW)
+    plain = tmp_path / "plain.parquet"
+    lae_sim.write_trace(
+        lae_sim.Trace(lae_sim.Metadata.new("30", "every-frame"), list(trace)), plain
+    )
+    options = ("--forecaster", "kalman-lae-pvt")
+    assert replay_json(SLOW, *options)["traces"][0]["notes"] == []
+    [note] = replay_json(plain, *options)["traces"][0]["notes"]
+    assert "does not clip forecasts where the image size is unknown" in note
+    assert note in replay(plain, *options)
+
+
 def test_attributes_that_the_trace_does_not_name(tmp_path):
     trace = lae_sim.read_trace(SLOW)
     plain = tmp_path / "plain.parquet"
