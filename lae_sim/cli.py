@@ -44,6 +44,7 @@ def exit_status(work: Callable[[], None], program: str) -> int:
         print(f"{program}: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
+        print(f"{program}: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader, such as head, has gone: stay silent from here on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

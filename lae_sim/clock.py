@@ -29,7 +29,10 @@ def parse_rational(text: str) -> Fraction:
     """
     digits = text[1:] if text.startswith("-") else text
     if not _RATIONAL.match(digits) or re.search(r"/0+\Z", digits):
-        raise LaeError(f"{text[:40]!r} is not an exact number: write 30, 29.97 or 30000/1001")
+        raise LaeError(
+            f"{text[:40]!r} is not an exact number of at most 12 digits: write 30, 29.97 or "
+            "30000/1001"
+        )
     return Fraction(text)
 
 
@@ -74,7 +77,13 @@ class Clock:
 
     @classmethod
     def at(cls, fps: Fraction) -> Clock:
-        """The clock of a world that delivers ``fps`` frames per second."""
+        """The clock of a world that delivers ``fps`` frames per second.
+
+        Raises:
+            LaeError: if it is not an exact number.
+        """
+        if not isinstance(fps, (Fraction, int)):
+            raise LaeError(f"a frame rate must be exact: parse_fps('30000/1001'), not {fps!r}")
         return cls(fps.numerator, fps.denominator * NS_PER_SECOND)
 
     @property
@@ -82,7 +91,6 @@ class Clock:
         """World frames per second."""
         return Fraction(self.ticks_per_ns * NS_PER_SECOND, self.frame_ticks)
 
-    @property
-    def frame_ms(self) -> float:
-        """Milliseconds between two frames, for display."""
-        return self.frame_ticks / self.ticks_per_ns / 1e6
+    def milliseconds(self, frames: Fraction | int) -> float:
+        """A time given in frames as milliseconds, for display."""
+        return float(frames / self.fps * 1000)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from lae_sim.cli import argument, exit_status
 from lae_sim.clock import Clock, parse_fps
 from lae_sim.errors import LaeError
+from lae_sim.files import check_distinct
 
 if TYPE_CHECKING:
     from lae_sim.annotations import GroundTruth
@@ -98,6 +99,7 @@ def _convert(arguments: argparse.Namespace) -> None:
 
     if arguments.repetition < 1:
         raise LaeError("--repetition counts from 1")
+    check_distinct([arguments.out], [arguments.results, *(p for _, p in arguments.truth_file)])
     kind, sources = find_results(arguments.results, arguments.format, arguments.repetition)
     truth = find_truth(arguments.truth).with_files(dict(arguments.truth_file))
     matched, skipped = _matched(kind, sources, truth, arguments)
@@ -123,7 +125,11 @@ def _convert(arguments: argparse.Namespace) -> None:
         metadata = Metadata.new(fps, "real-time", schedule={"policy": "latest"}, **about)
     else:
         metadata = Metadata.new(fps, "every-frame", **about)
+    read = [file for source in matched.values() for file in (source.path, source.times) if file]
+    check_distinct([arguments.out], [*read, *truth.files.values()])
     write_trace(Trace(metadata, recordings), arguments.out)
+    left_out = {*matched, *arguments.exclude}
+    unmatched = [name for name in truth.files if name not in left_out]
     summary = {
         "trace": str(arguments.out),
         "format": kind,
@@ -134,7 +140,7 @@ def _convert(arguments: argparse.Namespace) -> None:
         "timing": timing,
         **_figures(recordings),
         "without_truth": skipped,
-        "without_results": [name for name in truth.files if name not in matched],
+        "without_results": [] if arguments.sequence else unmatched,
     }
     print(json.dumps(summary, indent=2) if arguments.json else _text(summary))
 

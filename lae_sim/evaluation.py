@@ -39,6 +39,8 @@ class Evaluation:
     Attributes:
         sequences: names, S of them.
         frames: world frames of each, int64 [S].
+        truthless: world frames of each that have no ground truth, int64 [S].
+        missing: world frames of each without a box in the trace, int64 [S].
         processed: processed frames of each, int64 [S].
         departures: see :class:`lae_sim.run.Run`, int64 [S].
         init_ns: time of the initialisation, int64 [S].
@@ -53,6 +55,8 @@ class Evaluation:
 
     sequences: tuple[str, ...]
     frames: Ints
+    truthless: Ints
+    missing: Ints
     processed: Ints
     departures: Ints
     init_ns: Ints
@@ -99,8 +103,10 @@ def evaluate(
         at_arrival: score outputs at their own frames, as VOT does (see :func:`pair`).
 
     Raises:
-        LaeError: if there is no run, or whatever iterating over the runs raises.
+        LaeError: if there is no run or no forecaster, or whatever iterating over the runs raises.
     """
+    if not forecasters:
+        raise LaeError("name at least one forecaster, such as hold")
     parts = [
         _evaluate_group(group, metadata, forecasters, sigmas, convention, at_arrival)
         for group in batched(runs)
@@ -129,6 +135,8 @@ def _evaluate_group(
     return Evaluation(
         sequences=tuple(run.recording.name for run in runs),
         frames=pairing.lengths,
+        truthless=np.array([np.isnan(run.recording.truth[:, 0]).sum() for run in runs], np.int64),
+        missing=np.array([np.isnan(run.recording.boxes[:, 0]).sum() for run in runs], np.int64),
         processed=np.diff(pairing.offsets),
         departures=np.array([run.departures for run in runs], np.int64),
         init_ns=np.array([run.schedule.elapsed_ns[0] for run in runs], np.int64),

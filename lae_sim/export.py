@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -131,6 +131,7 @@ def result_folders(folder: str, names: Mapping[tuple[str, Fraction], str]) -> It
             raise LaeError(
                 f"{root / name} is there already: move it away, or choose another folder"
             )
+    made = not root.exists()
     try:
         root.mkdir(parents=True, exist_ok=True)
         staging = Path(tempfile.mkdtemp(prefix=".part-", dir=root))
@@ -156,6 +157,9 @@ def result_folders(folder: str, names: Mapping[tuple[str, Fraction], str]) -> It
             os.replace(staging / name, root / name)
     finally:
         shutil.rmtree(staging, ignore_errors=True)
+        if made:
+            with suppress(OSError):  # it stays if it has come to hold something
+                root.rmdir()
 
 
 def _text(boxes: Floats) -> str:
@@ -193,13 +197,19 @@ def _repeated(text: str, length: int) -> Any:
     return pa.repeat(pa.scalar(text, pa.string()), length)
 
 
+def sigma_text(sigma: Fraction) -> str:
+    """A permitted latency as a short exact number: ``0.5``, ``1/3``."""
+    short = f"{float(sigma):g}"
+    return short if "e" not in short and Fraction(short) == sigma else str(sigma)
+
+
 def result_names(
     stem: str, forecasters: Sequence[str], sigmas: Sequence[Fraction]
 ) -> dict[tuple[str, Fraction], str]:
     """Names of result folders: trace, forecaster, and sigma where it is not 0."""
     return {
         (forecaster, sigma): f"{stem}-{forecaster.replace(':', '.')}"
-        + (f"-sigma{float(sigma):g}" if sigma else "")
+        + (f"-sigma{sigma_text(sigma).replace('/', '_')}" if sigma else "")
         for forecaster in forecasters
         for sigma in sigmas
     }

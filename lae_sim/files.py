@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,8 +20,10 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         LaeError: if the file cannot be written there.
     """
-    target = Path(path)
+    target = Path(os.path.realpath(path))  # write where a link points
     try:
+        if target.exists() and not target.is_file():
+            raise LaeError(f"cannot write {path}: it is there already and is not a file")
         handle, name = tempfile.mkstemp(
             prefix=f".{target.name}.", suffix=".part", dir=target.parent
         )
@@ -39,6 +41,21 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise LaeError(f"cannot write {target}: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_distinct(
+    outputs: Iterable[str | os.PathLike[str]], inputs: Iterable[str | os.PathLike[str]]
+) -> None:
+    """Check that no output would replace an input or another output.
+
+    Raises:
+        LaeError: if two of them are the same file.
+    """
+    taken = {os.path.realpath(path) for path in inputs}
+    for path in outputs:
+        if os.path.realpath(path) in taken:
+            raise LaeError(f"{path} would replace a file that is read, or another output")
+        taken.add(os.path.realpath(path))
 
 
 def _sync(path: Path) -> None:

@@ -13,6 +13,7 @@ The class itself is the factory; name it ``package.module:MyForecaster`` on the 
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Optional, Protocol, runtime_checkable
@@ -148,7 +149,7 @@ def forecast(
         Boxes, float64 [P, 4].
 
     Raises:
-        LaeError: if a forecaster answers anything but four finite numbers.
+        LaeError: if a forecaster fails, or answers anything but four finite numbers.
     """
     lane = np.searchsorted(lanes.offsets, item, "right") - 1
     if isinstance(factory, LaneFactory):
@@ -159,6 +160,21 @@ def forecast(
         return (
             boxes if finish is None else finish(boxes, lanes.boxes[item], lanes.image_sizes[lane])
         )
+    try:
+        return _streamed(factory, lanes, item, frame, lane, name)
+    except LaeError:
+        raise
+    except Exception as error:  # a user's forecaster may fail in any way
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        raise LaeError(
+            f"{name}: {type(error).__name__}: {error} ({last.filename}, line {last.lineno})"
+        ) from error
+
+
+def _streamed(
+    factory: ForecasterFactory, lanes: Lanes, item: Ints, frame: Ints, lane: Ints, name: str
+) -> Floats:
+    """The forecasts of forecasters that are fed one box after another."""
     answers = np.empty((len(item), 4))
     fed, current = -1, -1
     forecaster: Any = None

@@ -93,10 +93,21 @@ class Metadata:
         return str(self.document.get("device", {}).get("model", "unknown"))
 
     @property
+    def dataset(self) -> str:
+        """The dataset's name, or ``"unknown"``."""
+        dataset = self.document.get("dataset", {})
+        return str(dataset.get("name", "unknown") if isinstance(dataset, dict) else dataset)
+
+    @property
     def timing_note(self) -> str | None:
         """What the trace says of times that were not measured, if it does."""
         note = self.document.get("timing", {}).get("source")
         return None if note in (None, "measured") else str(note)
+
+    @property
+    def names_attributes(self) -> bool:
+        """Whether any sequence has attributes."""
+        return any(entry.get("attributes") for entry in self.document.get("sequences", {}).values())
 
     def image_size(self, sequence: str) -> tuple[int, int] | None:
         """Width and height of the sequence's images in pixels, if known."""

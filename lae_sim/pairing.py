@@ -94,7 +94,9 @@ def pair(
         LaeError: if the sigmas are not ascending, or too fine or too large for 64-bit integers, or
             the outputs are not ready in order.
     """
-    if list(sigmas) != sorted(set(sigmas)):
+    if not all(isinstance(sigma, (Fraction, int)) for sigma in sigmas):
+        raise LaeError("permitted latencies must be exact: Fraction(1, 2), not 0.5")
+    if not sigmas or list(sigmas) != sorted(set(sigmas)):
         raise LaeError("permitted latencies must be ascending, each of them once")
     scale = lcm(*(sigma.denominator for sigma in sigmas))
     numerators = [int(sigma * scale) for sigma in sigmas]

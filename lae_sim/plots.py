@@ -54,22 +54,44 @@ def curves(
 
 
 def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Figure:
-    """Success and precision plots side by side, AUC and DP at 20 px in the legends."""
+    """Success and precision plots side by side, AUC and DP at 20 px in the legends.
+
+    Args:
+        named: curves by name; for several traces the names are ``"trace: forecaster"``.
+        title: above both plots.
+    """
     figure = _figure(10, 4.2)
     left, right = figure.subplots(1, 2)
     figure.suptitle(title)
+    traces = list(dict.fromkeys(name.rpartition(": ")[0] for name in named))
+    kinds = list(dict.fromkeys(name.rpartition(": ")[2] for name in named))
     for name, (success, precision) in named.items():
-        style = "--" if name == "offline" else "-"
+        trace, kind = traces.index(name.rpartition(": ")[0]), kinds.index(name.rpartition(": ")[2])
+        colour, style = f"C{trace if len(traces) > 1 else kind}", _style(kinds, kind, len(traces))
         overlap = np.linspace(0, 1, len(success))
-        left.plot(overlap, success, style, label=f"{name} [{success.mean():.3f}]")
-        right.plot(CENTRE_THRESHOLDS, precision, style, label=f"{name} [{precision[20]:.3f}]")
+        auc, dp = f"{name} [{success.mean():.3f}]", f"{name} [{precision[20]:.3f}]"
+        left.plot(overlap, success, color=colour, linestyle=style, label=auc)
+        right.plot(CENTRE_THRESHOLDS, precision, color=colour, linestyle=style, label=dp)
     left.set(xlabel="overlap threshold", ylabel="success", xlim=(0, 1), ylim=(0, 1))
     right.set(xlabel="centre error threshold (px)", ylabel="precision", xlim=(0, 50), ylim=(0, 1))
-    left.legend(title="AUC", loc="lower left")
-    right.legend(title="at 20 px", loc="lower right")
+    if len(named) <= 6:
+        left.legend(title="AUC", loc="lower left")
+        right.legend(title="at 20 px", loc="lower right")
+    else:
+        left.legend(title="AUC", loc="upper center", bbox_to_anchor=(0.5, -0.12))
+        right.legend(title="at 20 px", loc="upper center", bbox_to_anchor=(0.5, -0.12))
+        figure.set_size_inches(10, 4.6 + 0.22 * len(named))
     for axes in (left, right):
         axes.grid(alpha=0.3)
     return figure
+
+
+def _style(kinds: list[str], kind: int, traces: int) -> str:
+    """Dashes for offline; for several traces, whose colour tells them apart, one per forecaster."""
+    if kinds[kind] == "offline":
+        return "--"
+    others = [name for name in kinds if name != "offline"]
+    return ("-", ":", "-.")[others.index(kinds[kind]) % 3] if traces > 1 else "-"
 
 
 def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int = 20) -> Figure:
@@ -83,6 +105,7 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
     """
     schedule = run.schedule
     clock = schedule.clock
+    frame_ms = clock.milliseconds(1)
     end = min(first + count, schedule.length)
     figure = _figure(12, 3.6)
     axes = figure.subplots()
@@ -90,23 +113,21 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
     for frame in range(first, end):
         taken = frame in processed
         colour = "tab:blue" if taken else "tab:red"
-        axes.plot(
-            frame * clock.frame_ms, 2, "o", color=colour, fillstyle="full" if taken else "none"
-        )
-        axes.annotate(str(frame), (frame * clock.frame_ms, 2.18), ha="center", fontsize=7)
+        axes.plot(frame * frame_ms, 2, "o", color=colour, fillstyle="full" if taken else "none")
+        axes.annotate(str(frame), (frame * frame_ms, 2.18), ha="center", fontsize=7)
     ticks_per_ms = clock.ticks_per_ns * 1e6
     for frame, start, ready in zip(schedule.frames, schedule.start, schedule.ready):
         if ready >= first * clock.frame_ticks and frame < end:
             begin, length = start / ticks_per_ms, (ready - start) / ticks_per_ms
             axes.barh(1, length, left=begin, height=0.42, color="tab:blue", edgecolor="white")
-            if begin + length / 2 < (end + 0.5) * clock.frame_ms:
+            if begin + length / 2 < (end + 0.5) * frame_ms:
                 axes.text(begin + length / 2, 1, str(frame), ha="center", va="center", color="w")
     _draw_queries(axes, run, sigma, first, end)
     axes.set_yticks(
         [2, 1, 0], ["world frame\n(hollow: skipped)", "tracker busy", "query and source"]
     )
     axes.set(ylim=(-0.6, 2.5), xlabel="time (ms)", title=f"{run.recording.name}: who answers what")
-    axes.set_xlim((first - 0.5) * clock.frame_ms, (end + 0.5) * clock.frame_ms)
+    axes.set_xlim((first - 0.5) * frame_ms, (end + 0.5) * frame_ms)
     return figure
 
 
@@ -118,7 +139,7 @@ def _draw_queries(axes: Axes, run: Run, sigma: Fraction, first: int, end: int) -
     spans = zip(schedule.frames, schedule.ready, pairing.first[:, 0], pairing.end[:, 0])
     for source, ready, begin, stop in spans:
         for frame in range(max(begin, first), min(stop, end)):
-            query = float(frame + sigma) * clock.frame_ms
+            query = clock.milliseconds(frame + sigma)
             axes.plot(query, 0, "|", color="black", markersize=12)
             axes.annotate(f"{source}", (query, -0.4), ha="center", fontsize=7)
             if source:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from lae_sim.cli import argument, exit_status
 from lae_sim.clock import parse_fps, parse_rational
 from lae_sim.errors import LaeError
+from lae_sim.files import check_distinct
 from lae_sim.options import load_forecaster, parse_latency, parse_policy
 
 if TYPE_CHECKING:
@@ -125,9 +126,18 @@ def _replay(arguments: argparse.Namespace) -> None:
         raise LaeError(f"--{single[0]} takes one trace at a time")
     if arguments.eta is not None:
         arguments.sigma = [-eta for eta in arguments.eta]
+    arguments.sigma = list(dict.fromkeys(arguments.sigma))
+    arguments.forecaster = list(dict.fromkeys(arguments.forecaster))
+    arguments.traces = list(dict.fromkeys(arguments.traces))
+    outputs = [arguments.outputs, arguments.schedule, arguments.events, arguments.plot]
+    inputs = [*arguments.traces, *([arguments.timing] if arguments.timing else [])]
+    check_distinct([path for path in outputs if path], inputs)
     shown = sorted({float(sigma) for sigma in arguments.sigma})
     sigmas = sorted({*arguments.sigma, *(SIGMA_GRID if arguments.sigma_grid else ())})
-    jobs = [_Job.of(path, arguments, sigmas) for path in arguments.traces]
+    jobs = [
+        _Job.of(path, label, arguments, sigmas)
+        for path, label in zip(arguments.traces, _labels(arguments.traces))
+    ]
     with ExitStack() as files:  # whatever fails, no file is left behind
         reports = [_report(job, _sinks(job, arguments, files), arguments) for job in jobs]
         if arguments.plot:
@@ -145,6 +155,7 @@ class _Job:
 
     Attributes:
         path: the trace's file.
+        label: its name in tables and pictures.
         trace: the trace.
         timing: the trace that the times come from, if it is another.
         clock: the world's clock.
@@ -156,6 +167,7 @@ class _Job:
     """
 
     path: str
+    label: str
     trace: Trace
     timing: Trace | None
     clock: Clock
@@ -166,7 +178,9 @@ class _Job:
     convention: Convention
 
     @classmethod
-    def of(cls, path: str, arguments: argparse.Namespace, sigmas: Sequence[Fraction]) -> _Job:
+    def of(
+        cls, path: str, label: str, arguments: argparse.Namespace, sigmas: Sequence[Fraction]
+    ) -> _Job:
         from lae_sim.clock import Clock
         from lae_sim.latency import scaled
         from lae_sim.metrics import find_convention
@@ -174,12 +188,17 @@ class _Job:
         from lae_sim.trace import read_trace
 
         policy, at_arrival = parse_policy(arguments.policy)
+        if at_arrival and any(sigmas):
+            raise LaeError("vot-realtime never scores latency: it goes with no permitted latency")
         source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
         trace = read_trace(path, arguments.sequence)
         timing = read_trace(arguments.timing) if arguments.timing else None
+        if arguments.attributes and not trace.metadata.names_attributes:
+            raise LaeError(f"{path}: the trace names no attributes of its sequences")
         fps = arguments.fps or trace.metadata.fps
         return cls(
             path=path,
+            label=label,
             trace=trace,
             timing=timing,
             clock=Clock.at(fps),
@@ -196,16 +215,19 @@ def _report(
 ) -> Report:
     """Replay and score one trace, giving each run to the sinks."""
     from lae_sim.evaluation import evaluate
+    from lae_sim.notes import SkippedStalls, notes_on
     from lae_sim.report import attribute_members, trace_report
 
     metadata = job.trace.metadata
+    stalls = SkippedStalls()
+    if arguments.latency == "recorded" and job.timing is None:
+        sinks = [*sinks, stalls]
     runs = _written(_progress(job.runs(), job.path, job.trace.frames), sinks)
     evaluation = evaluate(
         runs, metadata, job.forecasters, job.sigmas, job.convention, job.at_arrival
     )
     members = attribute_members(metadata, evaluation.sequences)
-    if arguments.attributes and not members:
-        raise LaeError(f"{job.path}: the trace names no attributes of its sequences")
+    notes = notes_on(evaluation, metadata, job.convention, list(job.forecasters), job.at_arrival)
     figures = trace_report(
         evaluation,
         job.clock,
@@ -218,6 +240,7 @@ def _report(
     return {
         "trace": job.path,
         "tracker": metadata.tracker,
+        "dataset": metadata.dataset,
         "device": metadata.device,
         "times_from": arguments.timing or job.path,
         "times_note": (job.timing or job.trace).metadata.timing_note,
@@ -226,23 +249,9 @@ def _report(
         "latency": arguments.latency,
         "latency_scale": str(arguments.latency_scale),
         "convention": job.convention.name,
-        "notes": _notes(job, evaluation.sequences),
+        "notes": [*notes, *stalls.notes()],
         **figures,
     }
-
-
-def _notes(job: _Job, sequences: Sequence[str]) -> list[str]:
-    """What keeps the figures from being what their names promise."""
-    notes = []
-    if job.at_arrival:
-        notes.append("vot-realtime skips frames but never scores latency")
-    unknown = sum(job.trace.metadata.image_size(name) is None for name in sequences)
-    if unknown and "kalman-lae-pvt" in job.forecasters:
-        notes.append(
-            f"kalman-lae-pvt does not clip forecasts where the image size is unknown, as it is of "
-            f"{unknown} of {len(sequences)} sequences"
-        )
-    return notes
 
 
 def _sinks(
@@ -256,7 +265,6 @@ def _sinks(
 
     sinks: list[Callable[[Run], None]] = []
     answer_sinks: list[export.AnswerSink] = []
-    exported = dict.fromkeys(arguments.forecaster)
     if arguments.schedule:
         sinks.append(files.enter_context(export.schedule_file(arguments.schedule, job.clock)))
     if arguments.events:
@@ -265,14 +273,15 @@ def _sinks(
     if arguments.outputs:
         answer_sinks.append(files.enter_context(export.outputs_file(arguments.outputs)))
     if arguments.export_txt:
-        names = export.result_names(Path(job.path).stem, list(exported), job.sigmas)
+        stem = Path(job.label).with_suffix("").as_posix().strip("/.").replace("/", "-")
+        names = export.result_names(stem, arguments.forecaster, arguments.sigma)
         folders = export.result_folders(arguments.export_txt, names)
         answer_sinks.append(files.enter_context(folders))
 
     def answer(run: Run) -> None:
-        for name in exported:
+        for name in arguments.forecaster:
             factory = job.forecasters[name]
-            for sigma in job.sigmas:
+            for sigma in arguments.sigma:
                 found = answers(run, job.trace.metadata, name, factory, sigma, job.at_arrival)
                 for sink in answer_sinks:
                     sink(run, name, sigma, found)
@@ -303,15 +312,26 @@ def _plot(jobs: Sequence[_Job], sigma: Fraction, path: str) -> None:
     from pathlib import Path
 
     from lae_sim import plots
+    from lae_sim.export import sigma_text
 
     named: plots.Curves = {}
     for job in jobs:
         found = plots.curves(
             job.runs(), job.trace.metadata, job.forecasters, sigma, job.convention, job.at_arrival
         )
-        prefix = f"{Path(job.path).stem}: " if len(jobs) > 1 else ""
+        prefix = f"{Path(job.label).with_suffix('')}: " if len(jobs) > 1 else ""
         named.update({prefix + name: curve for name, curve in found.items()})
-    plots.save(plots.success_and_precision(named), path)
+    title = "" if len(jobs) > 1 else f"{jobs[0].label}: "
+    title += f"sigma {sigma_text(sigma)}, convention {jobs[0].convention.name}"
+    plots.save(plots.success_and_precision(named, title), path)
+
+
+def _labels(paths: Sequence[str]) -> list[str]:
+    """File names, where they tell the traces apart; otherwise the paths."""
+    from pathlib import Path
+
+    names = [Path(path).name for path in paths]
+    return names if len(set(names)) == len(names) else list(paths)
 
 
 def _print_tables(
@@ -324,7 +344,7 @@ def _print_tables(
             print(f"{report['trace']}\n\n{sequence_table(report, shown)}\n")
         if arguments.attributes:
             print(f"{report['trace']}\n\n{attribute_table(report, shown)}\n")
-    print(summary_table(reports, shown), end="\n\n")
+    print(summary_table(reports, _labels(arguments.traces), shown), end="\n\n")
     for report in reports:
         print(settings_text(report))
 

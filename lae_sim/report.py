@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,7 +43,7 @@ def trace_report(
     calls_ns = int(evaluation.calls_ns.sum())
     departures = int(evaluation.departures.sum())
     zero = sigmas.index(Fraction(0)) if 0 in sigmas else 0
-    offline = {metric: _mean(evaluation.offline[metric]) for metric in METRICS}
+    offline = {metric: _offline(evaluation, metric, slice(None)) for metric in METRICS}
     grid = set(SIGMA_GRID) <= set(sigmas)
     results = []
     for f, forecaster in enumerate(forecasters):
@@ -86,6 +85,7 @@ def trace_report(
     return {
         "sequences": len(evaluation.sequences),
         "world_frames": frames,
+        "frames_without_truth": int(evaluation.truthless.sum()),
         "processed": processed,
         "skip_rate": 1 - processed / frames,
         "mismatch_sum": int(evaluation.mismatch_sum[:, zero].sum()),
@@ -109,13 +109,20 @@ def _scores(
     means: Report = {m: _mean(evaluation.scores[m][f, which, s]) for m in METRICS}
     hold = forecasters.index("hold")
     for metric in ("auc", "dp20"):
-        offline = _mean(evaluation.offline[metric][which])
+        offline = _offline(evaluation, metric, which)
         baseline = _mean(evaluation.scores[metric][hold, which, s])
         recovered = None
         if None not in (offline, baseline, means[metric]) and f != hold and offline != baseline:
             recovered = (means[metric] - baseline) / (offline - baseline)  # type: ignore[operator]
         means[f"recovered_{metric}"] = recovered
     return means
+
+
+def _offline(evaluation: Evaluation, metric: str, which: slice | list[int]) -> float | None:
+    """Mean offline score over some sequences; none unless the trace has every frame of all."""
+    if evaluation.missing[which].any():
+        return None
+    return _mean(evaluation.offline[metric][which])
 
 
 def _staleness(evaluation: Evaluation, s: int, sigma: Fraction, clock: Clock) -> Report:
@@ -125,8 +132,8 @@ def _staleness(evaluation: Evaluation, s: int, sigma: Fraction, clock: Clock) ->
         "mismatch_sum": total,
         "mismatch_mean": total / frames,
         "mismatch_max": int(evaluation.mismatch_max[:, s].max()),
-        "age_ms": float(Fraction(total, frames) + sigma) * clock.frame_ms,
-        "longest_stale_ms": int(evaluation.longest_hold[:, s].max()) * clock.frame_ms,
+        "age_ms": clock.milliseconds(Fraction(total, frames) + sigma),
+        "longest_stale_ms": clock.milliseconds(int(evaluation.longest_hold[:, s].max())),
     }
 
 
@@ -164,8 +171,10 @@ def attribute_members(metadata: Metadata, sequences: Iterable[str]) -> dict[str,
     return dict(sorted(members.items()))
 
 
-def summary_table(reports: Sequence[Report], shown_sigmas: Sequence[float]) -> str:
-    """One line per trace, forecaster and permitted latency."""
+def summary_table(
+    reports: Sequence[Report], labels: Sequence[str], shown_sigmas: Sequence[float]
+) -> str:
+    """One line per trace, which has a label, forecaster and permitted latency."""
     grid = any("mauc" in result for report in reports for result in report["results"])
     header = ["trace", "forecaster"]
     header += ["sigma"] if len(shown_sigmas) > 1 or shown_sigmas != [0.0] else []
@@ -173,11 +182,11 @@ def summary_table(reports: Sequence[Report], shown_sigmas: Sequence[float]) -> s
     header += ["mAUC", "mDP"] if grid else []
     header += ["tracker", "skipped", "mismatch"]
     lines = []
-    for report in reports:
+    for label, report in zip(labels, reports):
         for result in report["results"]:
             if result["sigma"] not in shown_sigmas:
                 continue
-            line = [Path(report["trace"]).name, result["forecaster"]]
+            line = [label, result["forecaster"]]
             line += [f"{result['sigma']:g}"] if "sigma" in header else []
             for metric in ("auc", "dp20"):
                 offline = report["offline"] and report["offline"][metric]
@@ -194,7 +203,7 @@ def settings_text(report: Report) -> str:
     """What the figures of a trace rest on, and how far they can be trusted."""
     scale = report["latency_scale"]
     lines = [
-        f"{report['trace']}: {report['tracker']} on {report['device']}, "
+        f"{report['trace']}: {report['tracker']}, {report['dataset']}, device {report['device']}; "
         f"{report['sequences']} sequences, {report['world_frames']:,} world frames at "
         f"{report['fps']} fps, {report['processed']:,} processed",
         f"  convention {report['convention']}, policy {report['policy']}, "
@@ -205,7 +214,7 @@ def settings_text(report: Report) -> str:
             if report["times_from"] != report["trace"]
             else ""
         )
-        + f" (initialisation {report['init_ms']:.1f} ms)",
+        + f" (initialisation {report['init_ms']:.1f} ms on average)",
     ]
     if report["times_note"] is not None:
         lines.append(f"  times: {report['times_note']}")

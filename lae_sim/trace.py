@@ -27,7 +27,7 @@ BATCH_ROWS = 1 << 16
 Item = TypeVar("Item", bound=Sized)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trace:
     """A trace: its metadata, and its recordings sorted by name.
 
@@ -42,6 +42,9 @@ class Trace:
 
     def __iter__(self) -> Iterator[Recording]:
         return iter(self.recordings)
+
+    def __repr__(self) -> str:
+        return f"<Trace of {self.metadata.tracker!r} on {self.metadata.dataset!r}>"
 
 
 def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None = None) -> Trace:
@@ -157,7 +160,7 @@ class _StoredRecordings:
                 missing.discard(recording.name)
                 yield recording
         if missing:
-            raise LaeError(f"{self.path}: no sequence {', '.join(sorted(missing))}")
+            raise LaeError(f"{self.path}: no sequence {', '.join(map(repr, sorted(missing)))}")
 
     def _all(self) -> Iterator[Recording]:
         """Recordings, put together again where a batch ends inside one."""

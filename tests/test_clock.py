@@ -123,7 +123,7 @@ def test_the_clock_of_a_frame_rate(fps: str, ticks_per_ns: int, frame_ticks: int
     clock = Clock.at(parse_fps(fps))
     assert (clock.ticks_per_ns, clock.frame_ticks) == (ticks_per_ns, frame_ticks)
     assert clock.fps == Fraction(fps)
-    assert clock.frame_ms == pytest.approx(float(1000 / Fraction(fps)))
+    assert clock.milliseconds(1) == pytest.approx(float(1000 / Fraction(fps)))
 
 
 def test_no_float_loses_a_frame() -> None:

@@ -313,7 +313,9 @@ def test_mean_fps_file(tmp_path):
         given.of("a", 3)
     with pytest.raises(LaeError, match="no row for sequence 'c'"):
         given.of("c", 3)
-    with pytest.raises(LaeError, match="no tracker 'SRDCF'; give --tracker ECO or KCF"):
+    with pytest.raises(
+        LaeError, match="has ECO, KCF, not 'SRDCF'; if it is there under another name"
+    ):
         given_times(f"mean-fps:{path}", "SRDCF")
     write(path, "sequence,fps\na,25\n")
     assert given_times(f"mean-fps:{path}", "any").of("a", 7) == 40_000_000

@@ -264,6 +264,8 @@ class Still:
     def predict(self, frame):
         assert self.size == (1280, 720)
         return self.box
+def one_argument(box):
+    pass
 def broken(box, image_size=None):
     class Broken(Still):
         def predict(self, frame):
@@ -282,6 +284,8 @@ def test_a_forecaster_of_ones_own(tmp_path):
     assert [result["auc"] for result in own] == [result["auc"] for result in hold]
     error = replay(SLOW, "--forecaster", "mine:broken", cwd=tmp_path, status=2)
     assert "mine:broken: predicted" in error
+    error = replay(SLOW, "--forecaster", "mine:one_argument", cwd=tmp_path, status=2)
+    assert "mine:one_argument: TypeError: " in error
     assert "no-such" in replay(SLOW, "--forecaster", "no-such", status=2)
     assert "ModuleNotFoundError" in replay(SLOW, "--forecaster", "no_such:thing", status=2)
 
@@ -302,9 +306,14 @@ def test_a_forecaster_of_ones_own(tmp_path):
         ([SLOW, "--latency", "resample"], "whole number"),
         ([SLOW, "--latency-scale", "-2"], "below zero"),
         ([SLOW, "--convention", "mine"], "no convention 'mine'"),
-        ([SLOW, "--sequence", "no-such"], "no sequence no-such"),
+        ([SLOW, "--sequence", "no-such"], "no sequence 'no-such'"),
         ([SLOW, "--timing", "missing.parquet"], "no such file"),
         ([SLOW, FAST, "--outputs", "out.parquet"], "one trace at a time"),
+        ([SLOW, "--outputs", "out", "--events", "./out"], "or another output"),
+        ([SLOW, "--schedule", SLOW], "would replace a file that is read"),
+        ([SLOW, "--timing", FAST, "--plot", FAST], "would replace a file that is read"),
+        ([SLOW, "--outputs", os.devnull], "is not a file"),
+        ([SLOW, "--policy", "vot-realtime", "--sigma-grid"], "no permitted latency"),
         ([SLOW, "--outputs", "no/such/folder/out.parquet"], "cannot write"),
         ([REAL_TIME, "--latency-scale", "1/2", "--outputs", "o.parquet",
           "--schedule", "s.parquet", "--events", "e.jsonl", "--export-txt", "d"], "no time for it"),
@@ -315,6 +324,57 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(arguments, words, tmp_pa
     assert words in error
     leftovers = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert leftovers == []
+
+
+def written(path, recordings, kind="every-frame", **more):
+    lae_sim.write_trace(lae_sim.Trace(lae_sim.Metadata.new("30", kind, **more), recordings), path)
+    return path
+
+
+def test_no_offline_score_unless_every_sequence_has_every_frame(tmp_path):
+    [one] = lae_sim.read_trace(SLOW, ["boat-calm"])
+    [other] = lae_sim.read_trace(REAL_TIME, ["car-chase"])
+    path = written(tmp_path / "mixed.parquet", [one, other], kind="real-time")
+    report = replay_json(path, "--per-sequence", "--policy", "latest")["traces"][0]
+    assert report["offline"] is None
+    assert "some sequences lack the boxes" in report["notes"][0]
+    kalman = report["results"][1]
+    assert kalman["recovered_auc"] is None
+    assert [s["offline_auc"] is None for s in kalman["per_sequence"]] == [False, True]
+    assert kalman["per_sequence"][0]["recovered_auc"] is not None
+
+
+def test_frames_without_truth_are_counted_and_said(tmp_path):
+    [one, other] = lae_sim.read_trace(SLOW, ["boat-calm", "car-chase"])
+    bare = lae_sim.Recording.new("bare", other.truth * np.nan, other.boxes, other.elapsed_ns)
+    path = written(tmp_path / "bare.parquet", [bare, one])
+    report = replay_json(path)["traces"][0]
+    assert report["frames_without_truth"] == 300
+    assert "1 sequences have none at all, such as 'bare'" in report["notes"][0]
+    assert "missed by AUC and hit by DP" in report["notes"][0]
+    assert "leaves them out" in replay(path, "--convention", "exclude")
+
+
+def test_stalls_of_skipped_frames_are_said(tmp_path):
+    [one] = lae_sim.read_trace(FAST, ["boat-calm"])
+    one.elapsed_ns[1] = 14_000_000_000  # the initialisation takes longer than a frame
+    path = written(tmp_path / "stall.parquet", [one])
+    [note] = replay_json(path)["traces"][0]["notes"]
+    assert note.startswith("1 recorded times above 10 times the median (the longest 14 s)")
+    assert replay_json(path, "--latency", "by-call")["traces"][0]["notes"] == []
+
+
+def test_equal_file_names_and_equal_traces_do_not_collide(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "x.parquet").write_bytes(FAST.read_bytes())
+    both = ("a/x.parquet", "b/x.parquet")
+    options = ("--export-txt", "out", "--sigma", "1/3", "0.333333", "--plot", "p.svg")
+    text = replay(*both, *both, *options, cwd=tmp_path)
+    assert [line.split()[0] for line in text.splitlines()[2:10:4]] == list(both)
+    assert len(list((tmp_path / "out").iterdir())) == 8
+    assert (tmp_path / "out" / "a-x-hold-sigma1_3" / "boat-calm.txt").exists()
+    assert "b/x: kalman" in (tmp_path / "p.svg").read_text()
 
 
 def test_what_a_figure_is_not_is_said(tmp_path):

@@ -112,7 +112,7 @@ def test_some_sequences_can_be_chosen(path: Path, group: list[Recording]) -> Non
     write_trace(Trace(EVERY, group), path)
     chosen = read_trace(path, ["aa", "A b"])
     assert [r.name for r in chosen] == ["A b", "aa"]
-    with pytest.raises(LaeError, match="no sequence Bird, Car2"):
+    with pytest.raises(LaeError, match="no sequence 'Bird', 'Car2'"):
         list(read_trace(path, ["Car2", "aa", "Bird"]))
 
 

@@ -1,0 +1,69 @@
+"""What keeps the figures of a replay from being what their names promise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lae_sim.evaluation import Evaluation
+from lae_sim.metadata import Metadata
+from lae_sim.metrics import Convention
+from lae_sim.run import Run
+
+
+class SkippedStalls:
+    """Counts recorded stalls that no call met, since the frame was skipped."""
+
+    def __init__(self) -> None:
+        self._count = self._longest_ns = 0
+
+    def __call__(self, run: Run) -> None:
+        """Take in a run."""
+        skipped = run.recording.elapsed_ns.copy()
+        typical = np.median(skipped[skipped >= 0])
+        skipped[run.schedule.frames] = -1
+        stalls = skipped[skipped > 10 * typical]
+        self._count += len(stalls)
+        self._longest_ns = max([self._longest_ns, *stalls.tolist()])
+
+    def notes(self) -> list[str]:
+        """A note, if there were any."""
+        if not self._count:
+            return []
+        return [
+            f"{self._count} recorded times above 10 times the median (the longest "
+            f"{self._longest_ns / 1e9:.3g} s) are of skipped frames; --latency by-call meets them"
+        ]
+
+
+def notes_on(
+    evaluation: Evaluation,
+    metadata: Metadata,
+    convention: Convention,
+    forecasters: Sequence[str],
+    at_arrival: bool,
+) -> list[str]:
+    """What to say of the scores of a trace, a sentence each."""
+    notes = []
+    sequences = evaluation.sequences
+    bare = [n for n, i, t in zip(sequences, evaluation.frames, evaluation.truthless) if i == t]
+    if evaluation.truthless.any():
+        counted = "leaves them out" if convention.leaves_out else "counts them as missed by AUC"
+        counted += "" if convention.leaves_out else " and hit by DP"
+        notes.append(
+            f"{evaluation.truthless.sum():,} frames have no ground truth; {convention.name} "
+            + counted
+            + (f"; {len(bare)} sequences have none at all, such as {bare[0]!r}" if bare else "")
+        )
+    if evaluation.missing.any() and not evaluation.missing.all():
+        notes.append("no offline score: some sequences lack the boxes of skipped frames")
+    if at_arrival:
+        notes.append("vot-realtime skips frames but never scores latency")
+    unknown = sum(metadata.image_size(name) is None for name in sequences)
+    if unknown and "kalman-lae-pvt" in forecasters:
+        notes.append(
+            f"kalman-lae-pvt does not clip forecasts where the image size is unknown, as it is of "
+            f"{unknown} of {len(sequences)} sequences"
+        )
+    return notes
