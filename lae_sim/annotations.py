@@ -19,7 +19,7 @@ from lae_sim.boxes import Floats
 from lae_sim.errors import LaeError
 from lae_sim.tables import read_numbers
 
-_PER_SEQUENCE = re.compile(r"groundtruth(?:_rect)?(?:\.(\d))?\.txt\Z")
+_PER_SEQUENCE = re.compile(r"groundtruth(?:_rect)?(?:\.([0-9]))?\.txt\Z")
 _NOT_SEQUENCES = ("readme", "list", "license")
 _ANNOTATION_FOLDERS = ("annotations", "anno")
 _ATTRIBUTE_FOLDERS = ("att", "attributes")
@@ -95,7 +95,7 @@ class GroundTruth:
             with_tracker: whether ``_<tracker>`` may follow the sequence's name.
         """
         bare = name.removeprefix("uav_")
-        for guess in (name, bare, re.sub(r"[._](\d)\Z", r"-\1", name)):
+        for guess in (name, bare, re.sub(r"[._]([0-9])\Z", r"-\1", name)):
             if guess in self.files:
                 return guess
         if f"{name}-2" in self.files and f"{name}-1" not in self.files:

@@ -18,7 +18,7 @@ MAX_INT64 = 2**63 - 1
 _DECIMAL = r"[0-9]{1,12}(?:\.[0-9]{1,12})?"
 _RATIONAL = re.compile(rf"(?:{_DECIMAL}|[0-9]{{1,12}}/[0-9]{{1,12}})\Z")
 _DURATION = re.compile(rf"({_DECIMAL})(ns|us|ms|s)\Z")
-_UNIT_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": NS_PER_SECOND}
+UNIT_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": NS_PER_SECOND}
 
 
 def parse_rational(text: str) -> Fraction:
@@ -57,7 +57,7 @@ def parse_duration(text: str) -> int:
     match = _DURATION.match(text)
     if match is None:
         raise LaeError(f"{text[:40]!r} is not a duration: write it with its unit, such as 47ms")
-    duration = Fraction(match[1]) * _UNIT_NS[match[2]]
+    duration = Fraction(match[1]) * UNIT_NS[match[2]]
     if duration.denominator != 1:
         raise LaeError(f"{text!r} is not a whole number of nanoseconds")
     return int(duration)

@@ -168,7 +168,8 @@ def _matched(
             f"{arguments.truth}: no ground truth for {_listed(missing)}, of {len(sources)} results"
             + ("; --skip-missing leaves them out" if matched else "; is it the right dataset?")
         )
-    absent = sorted({*arguments.sequence, *arguments.exclude} - set(matched))
+    named = {*arguments.sequence, *arguments.exclude, *dict(arguments.truth_file)}
+    absent = sorted(named - set(matched))
     if absent:
         raise LaeError(f"{arguments.results}: no results of sequence {_listed(absent)}")
     kept = set(arguments.sequence or matched) - set(arguments.exclude)
@@ -347,7 +348,7 @@ def _truth_file(text: str) -> tuple[str, Path]:
 
 
 def _size(text: str) -> tuple[int, int]:
-    match = re.match(r"([1-9]\d{0,5})x([1-9]\d{0,5})\Z", text)
+    match = re.match(r"([1-9][0-9]{0,5})x([1-9][0-9]{0,5})\Z", text)
     if match is None:
         raise LaeError(f"{text!r} is not an image size: write it as 1280x720")
     return int(match[1]), int(match[2])

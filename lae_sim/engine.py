@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from operator import itemgetter
+from operator import index, itemgetter
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ the last call's; a frame beyond the sequence ends it.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Schedule:
     """What one sequence's processing looked like, in processing order.
 
@@ -72,6 +72,7 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
     Raises:
         LaeError: if the sequence is empty, a time is negative, a policy goes back in time, or an
             instant does not fit in 64-bit ticks.
+        TypeError: if a time is not an integer, such as seconds as a float.
     """
     if length < 1:
         raise LaeError("a sequence needs at least one frame")
@@ -103,7 +104,7 @@ def _tracker(
     end = length * interval
     frame = start = 0
     while True:
-        elapsed_ns = service(frame)
+        elapsed_ns = index(service(frame))
         if elapsed_ns < 0:
             raise LaeError(f"frame {frame}: a processing time cannot be negative ({elapsed_ns} ns)")
         calls.append((frame, start, start + elapsed_ns * ticks_per_ns))

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
-from lae_sim.forecast import ForecasterFactory, Lanes, forecast
+from lae_sim.forecast import ForecasterFactory, Lanes, forecast, own
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import (
     METRICS,
@@ -32,7 +32,7 @@ from lae_sim.run import Run
 from lae_sim.trace import batched
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evaluation:
     """Scores of S sequences, F forecasters and M permitted latencies.
 
@@ -45,7 +45,7 @@ class Evaluation:
         departures: see :class:`lae_sim.run.Run`, int64 [S].
         init_ns: time of the initialisation, int64 [S].
         calls_ns: total time of the other calls, int64 [S].
-        calls_hz: sum of 1/elapsed over the other calls that took any time, per second, [S].
+        calls_hz: sum of 1/elapsed over the other calls, per second, [S]; infinite if one took 0.
         mismatch_sum, mismatch_max: of i - psi(i), frames, int64 [S, M].
         longest_hold: most queries in a row with one answering output, frames, int64 [S, M].
         scores: per metric of ``METRICS``, float64 [F, S, M] in 0..1; NaN = leaves the mean.
@@ -141,7 +141,7 @@ def _evaluate_group(
         departures=np.array([run.departures for run in runs], np.int64),
         init_ns=np.array([run.schedule.elapsed_ns[0] for run in runs], np.int64),
         calls_ns=np.array([elapsed.sum() for elapsed in calls], np.int64),
-        calls_hz=np.array([(1e9 / elapsed[elapsed > 0]).sum() for elapsed in calls]),
+        calls_hz=np.array([_rates(elapsed).sum() for elapsed in calls]),
         mismatch_sum=pairing.mismatch_sum,
         mismatch_max=pairing.mismatch_max,
         longest_hold=pairing.longest_hold,
@@ -150,7 +150,14 @@ def _evaluate_group(
     )
 
 
-@dataclass(frozen=True)
+def _rates(elapsed_ns: Ints) -> Floats:
+    """Frames per second of each call, infinite for one that took no time."""
+    rates = np.full(len(elapsed_ns), np.inf)
+    np.divide(1e9, elapsed_ns, out=rates, where=elapsed_ns > 0)
+    return rates
+
+
+@dataclass(frozen=True, eq=False)
 class Answers:
     """The answer for every world frame of one sequence at one sigma.
 
@@ -185,7 +192,7 @@ def _answers(
     factory: ForecasterFactory,
 ) -> tuple[Histories, Pairs, Floats]:
     """The distinct pairs of a forecaster with their boxes, float64 [P, 4]."""
-    fed = histories(pairing, memoryless=getattr(factory, "memoryless", False))
+    fed = histories(pairing, memoryless=own(factory, "memoryless"))
     found = pairs(pairing, fed)
     boxes = np.concatenate([run.boxes for run in runs])
     sizes = [metadata.image_size(run.recording.name) or (np.inf, np.inf) for run in runs]

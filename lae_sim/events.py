@@ -11,13 +11,13 @@ from lae_sim.run import Run
 
 KINDS = (
     "frame arrived",
-    "output ready",
     "processing started",
     "frame skipped",
+    "output ready",
     "forecaster updated",
     "query answered",
 )
-"""Kinds of events, in the order in which those of one tick happen."""
+"""Kinds of events, in the order of a frame's life."""
 
 
 class Event(NamedTuple):
@@ -39,29 +39,31 @@ class Event(NamedTuple):
 def event_log(run: Run, sigma: Fraction = Fraction(0), at_arrival: bool = False) -> list[Event]:
     """All events of a run, for queries at one permitted latency.
 
-    A frame is skipped at the moment when a newer one starts, or at the end of the stream.
+    Within one tick frames arrive first, then come the tracker's events as it made them, then
+    queries. A frame is skipped at the moment when a newer one starts, or at the end of the stream.
     """
-    events = [*_world_and_tracker(run), *_queries(run, sigma, at_arrival)]
-    rank = {kind: i for i, kind in enumerate(KINDS)}
-    return sorted(events, key=lambda event: (event.tick, rank[event.kind], event.frame))
+    events = [*_world(run), *_tracker(run), *_queries(run, sigma, at_arrival)]
+    return sorted(events, key=lambda event: event.tick)  # stable: each stream is in causal order
 
 
-def _world_and_tracker(run: Run) -> Iterator[Event]:
+def _world(run: Run) -> Iterator[Event]:
+    for frame in range(run.schedule.length):
+        yield Event(frame * run.schedule.clock.frame_ticks, "frame arrived", frame)
+
+
+def _tracker(run: Run) -> Iterator[Event]:
     schedule = run.schedule
-    interval = schedule.clock.frame_ticks
-    for frame in range(schedule.length):
-        yield Event(frame * interval, "frame arrived", frame)
     expected = 0
     for frame, start, ready in zip(
         schedule.frames.tolist(), schedule.start.tolist(), schedule.ready.tolist()
     ):
+        yield Event(start, "processing started", frame)
         for skipped in range(expected, frame):
             yield Event(start, "frame skipped", skipped)
-        yield Event(start, "processing started", frame)
         yield Event(ready, "output ready", frame)
         expected = frame + 1
     for skipped in range(expected, schedule.length):
-        yield Event(schedule.length * interval, "frame skipped", skipped)
+        yield Event(schedule.length * schedule.clock.frame_ticks, "frame skipped", skipped)
 
 
 def _queries(run: Run, sigma: Fraction, at_arrival: bool) -> Iterator[Event]:

@@ -133,6 +133,15 @@ class ConstantVelocity:
         return Motion(lanes.boxes, velocity)
 
 
+def own(factory: ForecasterFactory, name: str) -> bool:
+    """Whether a factory's class itself has an attribute.
+
+    What it inherits does not count: a subclass may have changed the methods that a shortcut of its
+    base stands for.
+    """
+    return name in vars(factory if isinstance(factory, type) else type(factory))
+
+
 def forecast(
     factory: ForecasterFactory, lanes: Lanes, item: Ints, frame: Ints, name: str = "forecaster"
 ) -> Floats:
@@ -152,7 +161,7 @@ def forecast(
         LaeError: if a forecaster fails, or answers anything but four finite numbers.
     """
     lane = np.searchsorted(lanes.offsets, item, "right") - 1
-    if isinstance(factory, LaneFactory):
+    if own(factory, "run_lanes") and isinstance(factory, LaneFactory):
         motion = factory.run_lanes(lanes)
         interval = (frame - lanes.frames[item]).astype(np.float64)
         boxes: Floats = motion.position[item] + interval[:, None] * motion.velocity[item]

@@ -73,7 +73,8 @@ def read_run(path: Path, name: str, truth: Floats, clock: Clock) -> ReleasedRun:
     _check_frames(path, frames, len(truth))
     runtimes = next((key for key in ("runtime", "runtime_all") if key in content), None)
     if not seconds[0] and runtimes:  # the released scoring scripts set the first one to 0
-        seconds[0] = _second(path, *_column(path, content, runtimes)[0])
+        recorded = _column(path, content, runtimes)[:1]
+        seconds[: len(recorded)] = [_second(path, k, runtime) for k, runtime in recorded]
     init_known = seconds[0] > 0
     elapsed, prolonged_ns = _elapsed(path, frames, seconds, len(truth), clock, init_known)
     all_boxes = np.full((len(truth), 4), np.nan)

@@ -11,6 +11,7 @@ each convention has a name.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +44,7 @@ class Convention:
     """
 
     name: str
-    valid: str
+    valid: Literal["size", "positive", "finite"]
     leaves_out: bool = False
     thresholds: int = 21
     first_frame_is_truth: bool = False

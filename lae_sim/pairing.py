@@ -91,13 +91,15 @@ def pair(
             latency then plays no part.
 
     Raises:
-        LaeError: if the sigmas are not ascending, or too fine or too large for 64-bit integers, or
-            the outputs are not ready in order.
+        LaeError: if the clocks differ, calls overlap, or the sigmas are not ascending, or too fine
+            or too large for 64-bit integers.
     """
     if not all(isinstance(sigma, (Fraction, int)) for sigma in sigmas):
         raise LaeError("permitted latencies must be exact: Fraction(1, 2), not 0.5")
     if not sigmas or list(sigmas) != sorted(set(sigmas)):
         raise LaeError("permitted latencies must be ascending, each of them once")
+    if len({schedule.clock for schedule in schedules}) != 1:
+        raise LaeError("sequences of different frame rates cannot be paired together")
     scale = lcm(*(sigma.denominator for sigma in sigmas))
     numerators = [int(sigma * scale) for sigma in sigmas]
     interval = schedules[0].clock.frame_ticks
@@ -115,10 +117,10 @@ def pair(
     frames = np.concatenate([schedule.frames for schedule in schedules])
     if at_arrival:
         steps = frames * scale
-    elif any((np.diff(schedule.ready) < 0).any() for schedule in schedules):
+    elif any((s.start[1:] < s.ready[:-1]).any() for s in schedules):
         raise LaeError(
-            "an output is ready before that of an older frame, as under the rule of VOT: score "
-            "such a schedule at arrival"
+            "calls overlap, as under the rule of VOT, which never scores latency: score such a "
+            "schedule with at_arrival=True"
         )
     else:
         frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]), interval)

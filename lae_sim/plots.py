@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from lae_sim.boxes import Floats
 from lae_sim.errors import LaeError
 from lae_sim.evaluation import answers
+from lae_sim.files import written_whole
 from lae_sim.forecast import ForecasterFactory
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import CENTRE_THRESHOLDS, PYSOT, Convention, precision_curve, success_curve
@@ -34,23 +36,36 @@ def curves(
     at_arrival: bool = False,
 ) -> Curves:
     """Curves of the offline boxes, where the trace holds every frame, and of each forecaster."""
-    per_name: dict[str, list[tuple[Floats, Floats]]] = {}
+    successes: dict[str, list[Floats]] = {}
+    precisions: dict[str, list[Floats]] = {}
+    every_frame = True
     for run in runs:
         truth = run.recording.truth
         boxes = {"offline": run.recording.boxes}
         for name, factory in forecasters.items():
             boxes[name] = answers(run, metadata, name, factory, sigma, at_arrival).boxes
+        every_frame = every_frame and not np.isnan(run.recording.boxes).any()
         for name, answered in boxes.items():
             success = success_curve(truth, answered, convention)
             precision = precision_curve(truth, answered, convention)
-            per_name.setdefault(name, []).append((success, precision))
-            if np.isnan(answered).any():
-                per_name[name] = [(success * np.nan, precision * np.nan)]
-    means = {
-        name: (np.mean([s for s, _ in pairs], axis=0), np.mean([p for _, p in pairs], axis=0))
-        for name, pairs in per_name.items()
+            successes.setdefault(name, []).append(success)
+            precisions.setdefault(name, []).append(precision)
+    return {
+        name: (_mean(successes[name], convention), _mean(precisions[name], convention))
+        for name in successes
+        if name != "offline" or every_frame
     }
-    return {name: found for name, found in means.items() if not np.isnan(found[0]).any()}
+
+
+def _mean(curves: Sequence[Floats], convention: Convention) -> Floats:
+    """Mean of the sequences that the convention counts; NaN if there is none."""
+    kept = [
+        curve
+        for curve in curves
+        if not np.isnan(curve).any() and (curve.any() or not convention.drops_zeros)
+    ]
+    mean: Floats = np.mean(kept, axis=0) if kept else np.full_like(curves[0], np.nan)
+    return mean
 
 
 def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Figure:
@@ -148,21 +163,25 @@ def _draw_queries(axes: Axes, run: Run, sigma: Fraction, first: int, end: int) -
                 )
 
 
+def check_format(path: str) -> None:
+    """Check that a picture can be drawn to a file of this name.
+
+    Raises:
+        LaeError: if its ending is not known, or matplotlib is missing.
+    """
+    if Path(path).suffix[1:].lower() not in _figure(1, 1).canvas.get_supported_filetypes():
+        raise LaeError(f"cannot draw to {path}: name a .png, .svg or .pdf file")
+
+
 def save(figure: Figure, path: str) -> None:
     """Write a figure to a file whose ending says the format.
 
     Raises:
         LaeError: if it cannot be written, or the ending is not known.
     """
-    from pathlib import Path
-
-    from lae_sim.files import written_whole
-
-    ending = Path(path).suffix[1:].lower()
-    if ending not in figure.canvas.get_supported_filetypes():
-        raise LaeError(f"cannot draw to {path}: name a .png, .svg or .pdf file")
+    check_format(path)
     with written_whole(path) as temporary:
-        figure.savefig(temporary, format=ending, dpi=150)
+        figure.savefig(temporary, format=Path(path).suffix[1:].lower(), dpi=150)
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -11,7 +11,7 @@ from lae_sim.boxes import Floats
 from lae_sim.engine import Ints, Schedule
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recording:
     """One sequence of a trace, by world frame.
 
@@ -42,7 +42,7 @@ class Recording:
         elapsed_ns: npt.ArrayLike,
         score: npt.ArrayLike | None = None,
     ) -> Recording:
-        """A recording from anything array-like; ``score`` defaults to none.
+        """A recording from anything array-like (not copied); ``score`` defaults to none.
 
         Raises:
             ValueError: if the lengths differ.
@@ -62,7 +62,14 @@ class Recording:
         return recording
 
     @classmethod
-    def of_run(cls, name: str, schedule: Schedule, boxes: Floats, truth: Floats) -> Recording:
+    def of_run(
+        cls,
+        name: str,
+        schedule: Schedule,
+        boxes: Floats,
+        truth: Floats,
+        score: npt.NDArray[np.float32] | None = None,
+    ) -> Recording:
         """The real-time recording of a schedule.
 
         Args:
@@ -70,9 +77,12 @@ class Recording:
             schedule: what the engine returned.
             boxes: the box of each processed frame, float64 [n, 4].
             truth: ground truth of every world frame, float64 [T, 4].
+            score: the confidence of each processed frame, float32 [n], if known.
         """
         all_boxes = np.full((schedule.length, 4), np.nan)
         elapsed = np.full(schedule.length, -1, np.int64)
+        all_scores = np.full(schedule.length, np.nan, np.float32)
         all_boxes[schedule.frames] = boxes
+        all_scores[schedule.frames] = np.nan if score is None else score
         elapsed[schedule.frames] = schedule.elapsed_ns
-        return cls.new(name, truth, all_boxes, elapsed)
+        return cls.new(name, truth, all_boxes, elapsed, all_scores)

@@ -84,7 +84,8 @@ def parser() -> argparse.ArgumentParser:
         type=argument(parse_rational),
         default=[Fraction(0)],
         metavar="FRAMES",
-        help="permitted latencies: frame i is queried at (i + sigma) / fps (default: 0)",
+        help="permitted latencies: frame i is queried at (i + sigma) / fps (default: 0); "
+        "a negative fraction is written --sigma=-1/2",
     )
     sigma.add_argument(
         "--eta",
@@ -138,6 +139,10 @@ def _replay(arguments: argparse.Namespace) -> None:
         _Job.of(path, label, arguments, sigmas)
         for path, label in zip(arguments.traces, _labels(arguments.traces))
     ]
+    if arguments.plot:
+        from lae_sim.plots import check_format
+
+        check_format(arguments.plot)
     with ExitStack() as files:  # whatever fails, no file is left behind
         reports = [_report(job, _sinks(job, arguments, files), arguments) for job in jobs]
         if arguments.plot:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lae_sim.boxes import Floats
 from lae_sim.clock import Clock
 from lae_sim.evaluation import Evaluation
 from lae_sim.metadata import Metadata
@@ -24,7 +25,7 @@ def trace_report(
     forecasters: Sequence[str],
     sigmas: Sequence[Fraction],
     convention: str,
-    attributes: Mapping[str, Sequence[str]] | None = None,
+    attributes: Mapping[str, list[int]] | None = None,
     per_sequence: bool = False,
 ) -> Report:
     """The figures of one trace as a JSON object (documented in the README).
@@ -35,7 +36,7 @@ def trace_report(
         forecasters: names; ``"hold"`` must be among them.
         sigmas: permitted latencies in frames, ascending.
         convention: the convention's name.
-        attributes: for each attribute the sequences that have it, to report them apart.
+        attributes: for each attribute the indices of the sequences that have it, to report apart.
         per_sequence: whether to report each sequence.
     """
     frames, processed = int(evaluation.frames.sum()), int(evaluation.processed.sum())
@@ -64,7 +65,7 @@ def trace_report(
                 result["attributes"] = {
                     name: {
                         "sequences": len(members),
-                        **_scores(evaluation, forecasters, f, s, _indices(evaluation, members)),
+                        **_scores(evaluation, forecasters, f, s, members),
                     }
                     for name, members in attributes.items()
                 }
@@ -90,9 +91,7 @@ def trace_report(
         "skip_rate": 1 - processed / frames,
         "mismatch_sum": int(evaluation.mismatch_sum[:, zero].sum()),
         "tracker_fps": calls / calls_ns * 1e9 if calls_ns else None,
-        "tracker_fps_mean": float(evaluation.calls_hz.sum()) / calls
-        if calls and calls_ns
-        else None,
+        "tracker_fps_mean": _number(float(evaluation.calls_hz.sum()) / calls) if calls else None,
         "init_ms": float(np.mean(evaluation.init_ns)) / 1e6,
         "exact": departures == 0,
         "approximate_outputs": departures,
@@ -109,13 +108,21 @@ def _scores(
     means: Report = {m: _mean(evaluation.scores[m][f, which, s]) for m in METRICS}
     hold = forecasters.index("hold")
     for metric in ("auc", "dp20"):
-        offline = _offline(evaluation, metric, which)
-        baseline = _mean(evaluation.scores[metric][hold, which, s])
         recovered = None
-        if None not in (offline, baseline, means[metric]) and f != hold and offline != baseline:
-            recovered = (means[metric] - baseline) / (offline - baseline)  # type: ignore[operator]
+        if f != hold and not evaluation.missing[which].any():
+            scores = evaluation.scores[metric]
+            recovered = _recovered(
+                evaluation.offline[metric][which], scores[hold, which, s], scores[f, which, s]
+            )
         means[f"recovered_{metric}"] = recovered
     return means
+
+
+def _recovered(offline: Floats, hold: Floats, forecast: Floats) -> float | None:
+    """Share of the latency loss recovered, over sequences that count in all; none if no loss."""
+    counted = ~np.isnan(offline + hold + forecast)
+    loss = float((offline - hold)[counted].sum())
+    return float((forecast - hold)[counted].sum()) / loss if loss > 0 else None
 
 
 def _offline(evaluation: Evaluation, metric: str, which: slice | list[int]) -> float | None:
@@ -154,20 +161,15 @@ def _mean(values: Any) -> float | None:
 
 
 def _number(value: float) -> float | None:
-    return None if math.isnan(value) else float(value)
+    return float(value) if math.isfinite(value) else None
 
 
-def _indices(evaluation: Evaluation, members: Sequence[str]) -> list[int]:
-    chosen = set(members)
-    return [i for i, name in enumerate(evaluation.sequences) if name in chosen]
-
-
-def attribute_members(metadata: Metadata, sequences: Iterable[str]) -> dict[str, list[str]]:
-    """The sequences that have each attribute, attributes in order of their names."""
-    members: dict[str, list[str]] = {}
-    for sequence in sequences:
+def attribute_members(metadata: Metadata, sequences: Iterable[str]) -> dict[str, list[int]]:
+    """Indices of the sequences that have each attribute, attributes in order of their names."""
+    members: dict[str, list[int]] = {}
+    for i, sequence in enumerate(sequences):
         for attribute in metadata.attributes(sequence):
-            members.setdefault(attribute, []).append(sequence)
+            members.setdefault(attribute, []).append(i)
     return dict(sorted(members.items()))
 
 

@@ -18,7 +18,7 @@ from lae_sim.recording import Recording
 from lae_sim.trace import Trace
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """One sequence replayed.
 

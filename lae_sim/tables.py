@@ -14,16 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim.boxes import Floats
-from lae_sim.clock import MAX_INT64
+from lae_sim.clock import MAX_INT64, UNIT_NS
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
-
-UNIT_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 _MAX_BYTES = 1 << 28
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 # Lengths are bounded, so that no number needs more than moderate exact arithmetic.
-_NUMBER = re.compile(r"[+-]?(?:\d{1,40}\.?\d{0,40}|\.\d{1,40})(?:[eE][+-]?\d{1,3})?\Z")
+_NUMBER = re.compile(r"[+-]?(?:[0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})(?:[eE][+-]?[0-9]{1,3})?\Z")
 _UNITS_OF_ONE_FRAME = ((10**6, "ns"), (10**3, "us"), (1, "ms"))  # least median that looks so
 
 

@@ -272,3 +272,8 @@ def test_a_frame_that_the_trace_lacks_is_named(source: object) -> None:
     recording = Recording.new("Gull2", np.ones((9, 4)), boxes, elapsed)
     with pytest.raises(LaeError, match=r"sequence 'Gull2', frame 3"):
         replay_sequence(recording, CLOCK, source, fifo)
+
+
+def test_a_time_in_float_seconds_is_refused() -> None:
+    with pytest.raises(TypeError):
+        simulate(3, Clock(30, 10**9), lambda frame: 0.047, latest)  # type: ignore[arg-type, return-value]

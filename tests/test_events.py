@@ -61,3 +61,17 @@ def test_queries_come_sigma_later_and_between_ticks_count_down():
     log = lae_sim.event_log(run([50, 50]), sigma=Fraction(1, 3))
     queries = [event for event in log if event.kind == "query answered"]
     assert [event.tick for event in queries] == [333_333_333, 1_333_333_333]
+
+
+def test_outputs_of_one_tick_stand_in_the_order_of_their_making():
+    boxes = np.zeros((3, 4))
+    recording = lae_sim.Recording.new("sequence", boxes, boxes, np.array([250_000_000, 0, 0]))
+    fifo = lae_sim.replay_sequence(recording, CLOCK, policy=lae_sim.fifo)
+    log = lae_sim.event_log(fifo)
+    assert [event[1:3] for event in log if event.tick == 250 * MS] == [
+        ("output ready", 0),
+        ("processing started", 1),
+        ("output ready", 1),
+        ("processing started", 2),
+        ("output ready", 2),
+    ]

@@ -160,3 +160,14 @@ def test_an_answer_that_is_no_box_is_refused(answer: Any) -> None:
 def test_any_four_numbers_are_a_box(answer: Any) -> None:
     factory = type("Fine", (Answers,), {"answer": answer})
     assert forecast(factory, TWO, ITEM, FRAME).tolist() == [[1, 2, 3, 4]] * 3
+
+
+@pytest.mark.parametrize("base", [Hold, ConstantVelocity, Kalman])
+def test_a_subclass_that_predicts_otherwise_is_asked(base: type) -> None:
+    class Elsewhere(base):  # type: ignore[misc]
+        def predict(self, frame: int) -> list[float]:
+            return [9.0, 9.0, 9.0, 9.0]
+
+    lanes = Lanes(np.array([0, 1]), np.array([0]), np.ones((1, 4)), np.full((1, 2), np.inf))
+    answered = forecast(Elsewhere, lanes, np.array([0]), np.array([3]))
+    np.testing.assert_array_equal(answered, [[9.0] * 4])

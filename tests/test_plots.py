@@ -65,3 +65,26 @@ def test_saving_says_which_endings_there_are(trace, tmp_path):
     assert (tmp_path / "a.svg").read_text().startswith("<?xml")
     with pytest.raises(lae_sim.LaeError, match=r"name a \.png"):
         plots.save(figure, str(tmp_path / "a.docx"))
+
+
+@pytest.mark.parametrize("name", ["otb", "exclude", "got10k"])
+def test_curves_leave_out_the_sequences_that_the_scores_do(name):
+    box = np.tile([100.0, 50, 40, 30], (5, 1))
+    lost = np.where(np.arange(5)[:, None] == 0, [[0.0, 0, 0, 0]], box)
+    recordings = [
+        lae_sim.Recording.new("a", box, box, np.full(5, 10**6)),
+        lae_sim.Recording.new("b", lost, box + 900, np.full(5, 10**6)),
+        lae_sim.Recording.new("c", np.full((5, 4), np.nan), box, np.full(5, 10**6)),
+    ]
+    trace = lae_sim.Trace(lae_sim.Metadata.new("30", "every-frame"), recordings)
+    convention = lae_sim.CONVENTIONS[name]
+    curves = plots.curves(
+        lae_sim.replay_trace(trace), trace.metadata, FORECASTERS, convention=convention
+    )
+    found = lae_sim.evaluate(
+        lae_sim.replay_trace(trace), trace.metadata, FORECASTERS, convention=convention
+    )
+    for f, forecaster in enumerate(FORECASTERS):
+        success, precision = curves[forecaster]
+        assert success.mean() == pytest.approx(np.nanmean(found.scores["auc"][f]))
+        assert precision[20] == pytest.approx(np.nanmean(found.scores["dp20"][f]))

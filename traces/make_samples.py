@@ -152,7 +152,13 @@ def real_time(trace: Trace) -> Trace:
     for key in ("format", "version", "fps"):
         document.pop(key)
     recordings = [
-        Recording.of_run(run.recording.name, run.schedule, run.boxes, run.recording.truth)
+        Recording.of_run(
+            run.recording.name,
+            run.schedule,
+            run.boxes,
+            run.recording.truth,
+            run.recording.score[run.schedule.frames],
+        )
         for run in replay_trace(trace)
     ]
     return Trace(Metadata.new("30", "real-time", **document), recordings)
