@@ -135,7 +135,7 @@ def make_trace(tracker: Tracker) -> Trace:
         "30",
         "every-frame",
         tracker={"name": tracker.name, "version": "synthetic"},
-        device={"model": "synthetic device"},
+        device={"model": "none"},
         timing={"source": "synthetic (made up, not measured)"},
         dataset={"name": "synthetic", "made_by": "traces/make_samples.py"},
         sequences={
