@@ -3,8 +3,8 @@
 A source makes, for each recording, the service that the engine asks how long a frame takes. Random
 sources draw from one stream per sequence, seeded by the seed and the sequence's name, so the order
 and the number of sequences never change a result. Streams are raw 64-bit words of PCG64 and the
-arithmetic on them is ours, so that they are the same under every NumPy version; the lognormal one also rests
-on the platform's exp and log, whose last bit may differ before rounding to ns.
+arithmetic on them is ours, so that they are the same under every NumPy version; the lognormal one
+also rests on the platform's exp and log, whose last bit may differ before rounding to ns.
 """
 
 from __future__ import annotations
