@@ -23,7 +23,7 @@ from lae_sim.metadata import Metadata
 from lae_sim.recording import Recording
 from lae_sim.rows import BOX, TRUTH, Rows
 
-BATCH_ROWS = 1 << 16
+BATCH_ROWS = 1 << 15
 Item = TypeVar("Item", bound=Sized)
 
 
