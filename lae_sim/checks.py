@@ -7,10 +7,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from lae_sim.boxes import Floats, iou
+from lae_sim.boxes import Bools, Floats, iou
 from lae_sim.engine import Ints
 from lae_sim.errors import TraceError
-from lae_sim.rows import BOX, TRUTH, Bools, Rows
+from lae_sim.rows import BOX, TRUTH, Rows
 
 COLUMN_TYPES = {
     "sequence": "string",

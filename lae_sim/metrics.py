@@ -14,13 +14,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from lae_sim.boxes import Floats, centre, iou
+from lae_sim.boxes import Bools, Floats, centre, iou
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
-
-Bools = npt.NDArray[np.bool_]
 
 CENTRE_THRESHOLDS = np.arange(51, dtype=np.float64)
 NORM_THRESHOLDS = np.arange(51) / 100

@@ -10,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim.arrow import from_numpy, is_null, to_numpy
-from lae_sim.boxes import Floats
+from lae_sim.boxes import Bools, Floats
 from lae_sim.engine import Ints
 from lae_sim.recording import Recording
-
-Bools = npt.NDArray[np.bool_]
 
 TRUTH = ("truth_x", "truth_y", "truth_w", "truth_h")
 BOX = ("x", "y", "w", "h")
