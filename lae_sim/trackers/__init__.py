@@ -1,0 +1,6 @@
+"""Trackers, and the side of the worker process that runs them.
+
+The modules of this folder run on the tracker's own interpreter: Python 3.8 or newer with NumPy, and
+whatever the tracker itself needs. Of the package they import this folder and ``lae_sim.errors``
+alone.
+"""

@@ -1,0 +1,94 @@
+"""Trackers by the names that command lines use."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import sys
+from typing import Any, Mapping
+
+from lae_sim.errors import LaeError
+from lae_sim.trackers.protocol import Tracker
+
+NAMES = "dcf, nanotrack, opencv:NAME, pysot, pytracking, trax:COMMAND, package.module:factory"
+
+# name -> (module, class); what follows a colon is the first argument
+_BUILT_IN = {
+    "dcf": ("dcf", "Dcf"),
+    "nanotrack": ("nanotrack", "NanoTrack"),
+    "opencv": ("opencv", "OpenCv"),
+    "pysot": ("pysot", "PySot"),
+    "pytracking": ("pytracking", "PyTracking"),
+    "trax": ("trax", "Trax"),
+}
+_TAKE_ARGUMENT = ("opencv", "trax")
+
+
+def make_tracker(name: str, options: Mapping[str, Any]) -> Tracker:
+    """Make a tracker by its name, or a user's own as ``package.module:factory``.
+
+    Args:
+        name: such as ``"dcf"`` or ``"opencv:mil"``. Modules are also looked for in the current
+            folder.
+        options: keyword arguments of the factory.
+
+    Raises:
+        LaeError: if there is none of that name, it cannot be imported, or it does not take the
+            options.
+    """
+    kind, colon, value = name.partition(":")
+    if kind in _BUILT_IN and bool(value) == (kind in _TAKE_ARGUMENT):
+        module, attribute = _BUILT_IN[kind]
+        factory = getattr(importlib.import_module("lae_sim.trackers." + module), attribute)
+        positional = [value] if value else []
+    elif colon and kind not in _BUILT_IN:
+        factory, positional = _imported(name, kind, value), []
+    else:
+        raise LaeError(f"no tracker {name!r}: there are {NAMES}")
+    try:
+        inspect.signature(factory).bind(*positional, **options)
+    except TypeError as error:
+        raise LaeError(f"tracker {name!r}: {error}; it takes {_signature(factory)}") from error
+    tracker: Tracker = factory(*positional, **options)
+    return tracker
+
+
+def parse_options(items: Mapping[str, str]) -> "dict[str, Any]":
+    """Options given as text: ``3``, ``0.5`` and ``true`` become numbers and booleans."""
+    return {name: _value(text) for name, text in items.items()}
+
+
+def _value(text: str) -> Any:
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
+
+
+def _imported(name: str, module: str, attribute: str) -> Any:
+    here = os.getcwd()
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        factory: Any = importlib.import_module(module)
+        for part in attribute.split("."):
+            factory = getattr(factory, part)
+    except Exception as error:  # a user's module may fail in any way while it is imported
+        raise LaeError(f"tracker {name!r}: {type(error).__name__}: {error}") from error
+    if not callable(factory):
+        raise LaeError(f"tracker {name!r} is not callable")
+    return factory
+
+
+def _signature(factory: Any) -> str:
+    try:
+        found = inspect.signature(factory).parameters.values()
+    except (TypeError, ValueError):
+        return "other options"
+    names = [p.name for p in found if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    return ", ".join(names) or "no options"

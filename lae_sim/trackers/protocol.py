@@ -1,0 +1,36 @@
+"""What a tracker is."""
+
+from __future__ import annotations
+
+from typing import Optional, Protocol, Sequence, Tuple, Union
+
+import numpy as np
+import numpy.typing as npt
+
+Image = npt.NDArray[np.uint8]
+"""A frame as OpenCV has it: uint8 [H, W, 3], blue, green, red."""
+
+Box = Sequence[float]
+"""``x, y, w, h`` in pixels, origin at the top left."""
+
+Output = Optional[Union[Box, Tuple[Box, float]]]
+"""A box, a box with a confidence, or None where the target was not found."""
+
+
+class Tracker(Protocol):
+    """A single-object tracker.
+
+    A tracker may also have
+
+    - ``set_search(cx, cy, w, h)``: search the next frame around this centre for a target of this
+      size (float, pixels) instead of where it was last seen;
+    - ``sync()``: wait for the device to finish; the stopwatch calls it before each reading;
+    - ``describe() -> dict``: name, version, settings, weights_digest, libraries (JSON values);
+    - ``close()``: give resources back.
+    """
+
+    def init(self, frame: Image, box: Box) -> None:
+        """Start on a new sequence; may be called again for the next one."""
+
+    def track(self, frame: Image) -> Output:
+        """Find the target in the next frame."""
