@@ -1,8 +1,10 @@
 """Ground truth of tracking datasets, in their official folder layouts or as flat files.
 
-Known layouts: OTB100 and DTB70 (``<seq>/groundtruth_rect.txt``), UAVDT (``anno/<seq>_gt.txt``),
-UAV123, UAV123_10fps and UAV20L (``anno/<dataset>/<seq>.txt``), VisDrone-SOT
-(``annotations/<seq>.txt``), and any folder of ``<seq>.txt``.
+Known layouts: OTB100 and DTB70 (``<seq>/groundtruth_rect.txt``), GOT-10k, VOT and LaSOT
+(``<seq>/groundtruth.txt``, also in the folders of GOT-10k's splits, of LaSOT's classes and of a
+VOT workspace), UAVDT (``anno/<seq>_gt.txt``), UAV123, UAV123_10fps and UAV20L
+(``anno/<dataset>/<seq>.txt``), VisDrone-SOT (``annotations/<seq>.txt``), and any folder of
+``<seq>.txt``.
 """
 
 from __future__ import annotations
@@ -122,7 +124,7 @@ def find_truth(root: Path) -> GroundTruth:
         named = _PER_SEQUENCE.match(root.name)
         return GroundTruth(root, "unknown", {folder.name if named else root.stem: root})
     if not root.is_dir():
-        raise LaeError(f"{root}: no such folder; --truth takes the dataset's folder")
+        raise LaeError(f"{root}: no such folder; give the dataset's folder")
     files = _in_sequence_folders(root) or _flat(_annotation_folder(root))
     if not files:
         raise LaeError(
@@ -188,14 +190,30 @@ def read_attributes(truth: GroundTruth) -> dict[str, tuple[str, ...]]:
 
 def _in_sequence_folders(root: Path) -> dict[str, Path]:
     """``<seq>/groundtruth_rect.txt``; with ``.1`` and ``.2`` for two targets in one video."""
+    folders = _folders(root)
+    nested = (path for folder in folders for path in _folders(folder) if _is_nested(path))
+    return _per_sequence([root, *folders]) or _per_sequence(nested)
+
+
+def _is_nested(folder: Path) -> bool:
+    """Whether a sequence's folder is in that of a class, a split or a VOT workspace's sequences."""
+    outer = folder.parent.name
+    return outer == "sequences" or folder.name.startswith((f"{outer}-", "GOT-10k_"))
+
+
+def _per_sequence(folders: Iterable[Path]) -> dict[str, Path]:
     files = {}
-    for folder in (root, *sorted(path for path in root.iterdir() if path.is_dir())):
+    for folder in folders:
         for path in sorted(folder.glob("groundtruth*.txt")):
             match = _PER_SEQUENCE.match(path.name)
             if match:
                 name = folder.resolve().name
                 files[f"{name}-{match[1]}" if match[1] else name] = path
     return files
+
+
+def _folders(root: Path) -> list[Path]:
+    return sorted(path for path in root.iterdir() if path.is_dir())
 
 
 def _annotation_folder(root: Path) -> Path:
@@ -206,14 +224,13 @@ def _annotation_folder(root: Path) -> Path:
             continue
         if _flat(folder):
             return folder
-        inner = {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()}
-        found = {name: path for name, path in inner.items() if _flat(path)}
+        found = {path.name: path for path in _folders(folder) if _flat(path)}
         if root.resolve().name in found:
             return found[root.resolve().name]
         if len(found) > 1:
             raise LaeError(
                 f"{folder}: holds the ground truth of {', '.join(found)}; give one of them, "
-                f"such as --truth {next(iter(found.values()))}"
+                f"such as {next(iter(found.values()))}"
             )
         if found:
             return next(iter(found.values()))
@@ -235,8 +252,9 @@ def _flat(folder: Path) -> dict[str, Path]:
 
 def _dataset(file: Path) -> str:
     folder = file.resolve().parent
-    within = folder.name in _ANNOTATION_FOLDERS or _PER_SEQUENCE.match(file.name)
-    return folder.parent.name if within else folder.name
+    if _PER_SEQUENCE.match(file.name):
+        return (folder.parent.parent if _is_nested(folder) else folder.parent).name
+    return folder.parent.name if folder.name in _ANNOTATION_FOLDERS else folder.name
 
 
 def _from_csv(path: Path, sequences: Iterable[str]) -> dict[str, tuple[str, ...]]:

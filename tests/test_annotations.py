@@ -28,6 +28,13 @@ LAYOUTS = {
         "OTB100/Human4/groundtruth_rect.2.txt",
         "OTB100/Tiger1/groundtruth_rect.txt",
     ],
+    "GOT-10k": [
+        "GOT-10k/test/GOT-10k_Test_000001/groundtruth.txt",
+        "GOT-10k/val/GOT-10k_Val_000001/groundtruth.txt",
+    ],
+    "LaSOT": ["LaSOT/boat/boat-1/groundtruth.txt", "LaSOT/cat/cat-20/groundtruth.txt"],
+    "LaSOT_flat": ["LaSOT_flat/boat-1/groundtruth.txt"],
+    "VOT": ["VOT/sequences/ants1/groundtruth.txt", "VOT/sequences/list.txt"],
     "flat": ["flat/anno/a.txt", "flat/anno/b.txt"],
     "bare": ["bare/a.txt", "bare/b.txt", "bare/README.txt", "bare/list.txt"],
 }
@@ -39,6 +46,10 @@ NAMES = {
     "UAV123_10fps": ["bike1"],
     "VisDrone": ["uav0000011_00000_s"],
     "OTB100": ["Human4-2", "Jogging-1", "Jogging-2", "Tiger1"],
+    "GOT-10k": ["GOT-10k_Test_000001", "GOT-10k_Val_000001"],
+    "LaSOT": ["boat-1", "cat-20"],
+    "LaSOT_flat": ["boat-1"],
+    "VOT": ["ants1"],
     "flat": ["a", "b"],
     "bare": ["a", "b"],
 }
