@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Optional, Protocol, Sequence, Tuple, Union
+from typing import TYPE_CHECKING, Optional, Protocol, Sequence, Tuple, Union
 
 import numpy as np
-import numpy.typing as npt
 
-Image = npt.NDArray[np.uint8]
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    Image = npt.NDArray[np.uint8]
+else:  # NumPy before 1.20, which Ubuntu 20.04 and so JetPack 5 bring, has no typing
+    Image = np.ndarray
 """A frame as OpenCV has it: uint8 [H, W, 3], blue, green, red."""
 
 Box = Sequence[float]

@@ -1,0 +1,196 @@
+"""A stopwatch around a tracker, in the process where the tracker runs."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import sys
+import textwrap
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from time import perf_counter_ns, process_time_ns
+from typing import TYPE_CHECKING, Any
+
+from lae_sim.errors import LaeError
+from lae_sim.trackers.names import make_tracker
+from lae_sim.trackers.protocol import Image
+
+if TYPE_CHECKING:
+    from typing import TypeGuard  # from Python 3.10 on
+
+LARGEST = 1e9
+"""The largest number in a box, pixels: what lies beyond is no place in an image."""
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""The environment variables that libraries read when they are imported."""
+
+_LIBRARIES = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "cv2": "opencv",
+    "torch": "torch",
+    "torchvision": "torchvision",
+    "onnxruntime": "onnxruntime",
+    "tensorrt": "tensorrt",
+    "tensorflow": "tensorflow",
+    "jax": "jax",
+}
+
+
+class Stopwatch:
+    """A tracker whose calls are timed and whose answers are checked.
+
+    The time is that of ``init`` or ``track`` alone, until the answer is numbers and, if the tracker
+    has ``sync``, its device is at rest. A frame is the tracker's own copy: it may keep it or write
+    to it. The garbage collector is left on: a tracker in use has it too, so its pauses are latency.
+
+    Args:
+        tracker: the name, see `make_tracker`.
+        options: keyword arguments of its factory.
+        threads: threads that OpenCV and torch may use; None leaves them as they are.
+
+    Attributes:
+        sets_search: whether the tracker can be told where to search.
+
+    Raises:
+        LaeError: if the tracker cannot be made; by each method, if the tracker raises. After that
+            it must be initialised again.
+    """
+
+    def __init__(
+        self, tracker: str, options: Mapping[str, Any], threads: int | None = None
+    ) -> None:
+        self._threads = threads
+        self._tracker: Any = _explained(make_tracker, tracker, options)
+        self._sync: Callable[[], object] = getattr(self._tracker, "sync", _at_rest)
+        self._started = False
+        self.sets_search = hasattr(self._tracker, "set_search")
+        self._limit_threads()
+
+    def init(self, frame: Image, box: Sequence[float]) -> dict[str, Any]:
+        """Start on a new sequence; what is answered has the fields of `lae_sim.timed.Answer`."""
+        self._started = False
+        _, elapsed_ns, cpu_ns = _explained(self._timed, self._tracker.init, frame.copy(), box)
+        self._limit_threads()  # for libraries that the tracker imports only now
+        self._started = True
+        return {"box": list(box), "score": None, "elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns}
+
+    def track(self, frame: Image, search: Sequence[float] | None = None) -> dict[str, Any]:
+        """Find the target, around ``cx, cy, w, h`` if ``search`` is given."""
+        if not self._started:
+            raise LaeError("the tracker must be initialised first")
+        self._started = False
+        if search is not None:
+            if not self.sets_search:
+                raise LaeError("the tracker cannot be told where to search: it has no set_search")
+            _explained(self._tracker.set_search, *search)
+        output, elapsed_ns, cpu_ns = _explained(self._timed, self._tracker.track, frame.copy())
+        box, score = _checked(output)
+        self._started = True
+        return {"box": box, "score": score, "elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns}
+
+    def describe(self) -> dict[str, Any]:
+        """What the tracker says of itself, and its interpreter and libraries, as JSON values."""
+        own = _explained(getattr(self._tracker, "describe", dict))
+        found = {
+            **own,
+            "python": platform.python_version(),
+            "libraries": {**_versions(), **own.get("libraries", {})},
+            "threads": _threads(),
+            "synchronised": self._sync is not _at_rest,
+            **_cuda(),
+        }
+        plain: dict[str, Any] = json.loads(_explained(json.dumps, found, default=_text))
+        return plain
+
+    def close(self) -> None:
+        """Have the tracker give its resources back."""
+        _explained(getattr(self._tracker, "close", _at_rest))
+
+    def _timed(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, int, int]:
+        self._sync()
+        cpu, start = process_time_ns(), perf_counter_ns()
+        output = _plain(call(*arguments))  # an answer still being computed on a device waits here
+        self._sync()
+        return output, perf_counter_ns() - start, process_time_ns() - cpu
+
+    def _limit_threads(self) -> None:
+        cv2, torch = sys.modules.get("cv2"), sys.modules.get("torch")
+        if self._threads and cv2 and cv2.getNumThreads() != self._threads:
+            cv2.setNumThreads(self._threads)
+        if self._threads and torch and torch.get_num_threads() != self._threads:
+            torch.set_num_threads(self._threads)
+
+
+def _at_rest() -> None:
+    pass
+
+
+def _explained(call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Call what may raise anything, and say what and where it raised."""
+    try:
+        return call(*arguments, **options)
+    except LaeError:
+        raise
+    except (Exception, SystemExit) as error:  # some scripts exit where they should raise
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        message = textwrap.shorten(str(error), 300)
+        text = f"{type(error).__name__}: {message} ({place.filename}, line {place.lineno})"
+        raise LaeError(text) from error
+
+
+def _plain(output: Any) -> Any:
+    """Arrays, tensors and NumPy's numbers as lists and Python's numbers."""
+    if isinstance(output, (list, tuple)):
+        return [_plain(item) for item in output]
+    return output.tolist() if hasattr(output, "tolist") else output
+
+
+def _checked(output: Any) -> tuple[list[float] | None, float | None]:
+    scored = isinstance(output, list) and len(output) == 2
+    box, score = output if scored else (output, None)
+    if box is not None:
+        numbers = box if isinstance(box, list) else []
+        if len(numbers) != 4 or not all(_is_number(v) and abs(v) <= LARGEST for v in numbers):
+            raise LaeError(f"answered {repr(output)[:80]}, not a box of four finite numbers")
+        box = [float(v) for v in numbers]
+    return box, float(score) if _is_number(score) and math.isfinite(score) else None
+
+
+def _is_number(value: Any) -> TypeGuard[float]:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _versions() -> dict[str, str]:
+    found = {
+        name: getattr(sys.modules.get(module), "__version__", None)
+        for module, name in _LIBRARIES.items()
+    }
+    return {name: str(version) for name, version in found.items() if version is not None}
+
+
+def _threads() -> dict[str, Any]:
+    found: dict[str, Any] = {n: os.environ[n] for n in THREAD_VARIABLES if n in os.environ}
+    cv2, torch = sys.modules.get("cv2"), sys.modules.get("torch")
+    if cv2:
+        found["opencv"] = cv2.getNumThreads()
+    if torch:
+        found["torch"] = torch.get_num_threads()
+    return found
+
+
+def _cuda() -> dict[str, Any]:
+    """What torch says of CUDA, and of the GPU if it is in use: asking would take it into use."""
+    torch = sys.modules.get("torch")
+    if not torch or not torch.version.cuda:
+        return {}
+    found = {"cuda": torch.version.cuda, "cudnn": torch.backends.cudnn.version()}
+    if torch.cuda.is_initialized():
+        found["gpu"] = torch.cuda.get_device_name()
+    return found
+
+
+def _text(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)

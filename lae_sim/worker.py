@@ -1,0 +1,355 @@
+"""A tracker in a process of its own, which may hang, crash, and run on another interpreter."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import mmap
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from lae_sim.errors import LaeError
+from lae_sim.frames import Image
+from lae_sim.timed import Answer, TrackerFailure
+from lae_sim.trackers.stopwatch import THREAD_VARIABLES, Stopwatch
+
+SERVE = Path(__file__).with_name("trackers") / "serve.py"
+"""The script of the process."""
+
+GLANCE_S = 0.25
+"""How often a process at work is looked at, in seconds."""
+
+
+LAST_WORDS = 10_000
+"""How many bytes of what a process printed are kept, to say why it crashed."""
+
+CLOSE_S = 2.0
+"""How long a tracker may take to close, and its process to exit, in seconds."""
+
+_FIRST_FRAME = re.compile(r"most recent call first\):\n\s*(File .*)")
+
+
+class Worker:
+    """A tracker in a process of its own: a `lae_sim.timed.TimedTracker`, for ``with``.
+
+    The process stays over sequences. One that crashes or takes too long is ended, with all that it
+    started, and the next `init` starts another. It ends with the thread that started it. What the
+    tracker prints is passed on to the standard error after each answer.
+
+    Args:
+        tracker: the tracker's name, see `lae_sim.trackers.names.make_tracker`.
+        options: keyword arguments of its factory (JSON values).
+        python: an interpreter, Python 3.8 or newer with NumPy; None is this one.
+        threads: threads that the tracker's libraries may use; None leaves them as they are.
+        timeout: seconds that a call may take.
+        setup_timeout: seconds that starting the process and making the tracker may take.
+
+    Raises:
+        LaeError: if the interpreter does not start or the tracker cannot be made.
+    """
+
+    def __init__(
+        self,
+        tracker: str,
+        options: Mapping[str, Any],
+        python: str | None = None,
+        threads: int | None = None,
+        timeout: float = 30.0,
+        setup_timeout: float = 300.0,
+    ) -> None:
+        if os.name != "posix":
+            raise LaeError("worker processes need Linux or macOS: run the tracker in this process")
+        self._tracker, self._options, self._threads = tracker, dict(options), threads
+        self._python = python or sys.executable
+        self._timeout, self._setup_timeout = timeout, setup_timeout
+        self._process: subprocess.Popen[bytes] | None = None
+        self._control: socket.socket
+        self._memory: mmap.mmap | bytes = b""
+        self._said = b""
+        self._files = contextlib.ExitStack()
+        self._log = self._files.enter_context(tempfile.TemporaryFile(buffering=0))  # noqa: SIM115
+        self._frames = self._files.enter_context(_shared_file())
+        try:
+            self._start()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def sets_search(self) -> bool:
+        """Whether the tracker can be told where to search."""
+        return self._sets_search
+
+    def init(self, frame: Image, box: Sequence[float]) -> Answer:
+        """Start on a new sequence, in a new process if there is none.
+
+        Raises:
+            TrackerFailure: if the tracker raises, crashes or takes too long.
+            LaeError: if it cannot be made any more.
+        """
+        if self._process is None or self._process.poll() is not None:
+            self._start()
+        shape = self._hand_over(frame)
+        return _answer(self._ask("init", self._timeout, shape=shape, box=_four(box)))
+
+    def track(self, frame: Image, search: Sequence[float] | None = None) -> Answer:
+        """Find the target, around ``cx, cy, w, h`` if ``search`` is given.
+
+        Raises:
+            TrackerFailure: if the tracker raises, crashes, takes too long, answers anything but a
+                box, or has not been initialised.
+        """
+        if self._process is None:
+            raise TrackerFailure(f"{self._tracker}: the tracker must be initialised first")
+        shape = self._hand_over(frame)
+        where = None if search is None else _four(search)
+        return _answer(self._ask("track", self._timeout, shape=shape, search=where))
+
+    def describe(self) -> Mapping[str, Any]:
+        """What the tracker says of itself, and the interpreter and libraries it runs on."""
+        if self._process is None:
+            self._start()
+        found: Mapping[str, Any] = self._ask("describe", self._timeout)
+        return found
+
+    def close(self) -> None:
+        """End the tracker and its process."""
+        try:
+            if self._process is not None:
+                with contextlib.suppress(TrackerFailure, subprocess.TimeoutExpired):
+                    self._ask("close", CLOSE_S)
+                    self._control.close()  # on which it exits by itself
+                    self._process.wait(CLOSE_S)
+        finally:
+            self._kill()
+            self._files.close()
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _start(self) -> None:
+        self._kill()
+        ours, theirs = socket.socketpair()
+        self._control = ours
+        self._poll = select.poll()
+        self._poll.register(ours, select.POLLIN)
+        limits = {name: str(self._threads) for name in THREAD_VARIABLES if self._threads}
+        with theirs:
+            inherited = theirs.fileno(), self._frames.fileno()
+            try:
+                self._process = subprocess.Popen(
+                    [self._python, str(SERVE), *map(str, inherited)],
+                    stdin=subprocess.DEVNULL,
+                    stdout=self._log,
+                    stderr=self._log,
+                    env={**os.environ, **limits},
+                    pass_fds=inherited,
+                    start_new_session=True,  # Ctrl-C is for this process alone
+                )
+            except OSError as error:
+                ours.close()
+                raise LaeError(f"{self._python} does not start: {error.strerror}") from error
+        try:
+            self._sets_search: bool = self._ask(
+                "setup",
+                self._setup_timeout,
+                tracker=self._tracker,
+                options=self._options,
+                threads=self._threads,
+            )
+        except TrackerFailure as error:
+            self._kill()
+            raise LaeError(str(error)) from None
+
+    def _hand_over(self, frame: Image) -> tuple[int, ...]:
+        _check_frame(frame)
+        if frame.nbytes > len(self._memory):
+            os.truncate(self._frames.fileno(), frame.nbytes)
+            self._memory = mmap.mmap(self._frames.fileno(), frame.nbytes)
+        shared = np.frombuffer(self._memory, np.uint8, frame.size).reshape(frame.shape)
+        np.copyto(shared, frame)
+        return frame.shape
+
+    def _ask(self, do: str, limit: float, **question: Any) -> Any:
+        line = json.dumps({"do": do, **question}).encode() + b"\n"
+        try:
+            with contextlib.suppress(ConnectionError):  # the death is found where answers are read
+                self._control.sendall(line)
+            answer = json.loads(self._line(do, limit))
+        except BaseException:  # with Ctrl-C too: the answer would be taken for that of the next
+            self._kill()
+            raise
+        self._pass_on()
+        if "error" in answer:
+            raise TrackerFailure(f"{self._tracker}: {do}: {answer['error']}")
+        return answer["answer"]
+
+    def _line(self, do: str, limit: float) -> bytes:
+        """The next line of the process; it says why if there is none."""
+        assert self._process is not None
+        self._said = b""
+        line, deadline = b"", time.monotonic() + limit
+        while not line.endswith(b"\n"):
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise TrackerFailure(f"{self._tracker}: {do} exceeded {limit:g} s")
+            if self._poll.poll(1000 * min(left, GLANCE_S)):
+                part = _received(self._control)
+                line, dead = line + part, not part
+            else:  # a child of the tracker may hold the socket open
+                dead = self._process.poll() is not None
+                self._pass_on()
+            if dead:
+                raise TrackerFailure(f"{self._tracker}: {do}: {self._cause()}")
+        return line
+
+    def _cause(self) -> str:
+        """How the process ended, and its last words."""
+        code = self._kill()
+        ends = {-s.value: s.name for s in signal.Signals}
+        how = f"was ended by {ends.get(code, code)}" if code < 0 else f"exited with status {code}"
+        if code == -signal.SIGKILL:
+            how += " (out of memory?)"
+        words, _, crash = self._said.decode(errors="replace").partition("Fatal Python error")
+        place = _FIRST_FRAME.search(crash)
+        said = words.split("\n")[-2:-1] + ([place[1]] if place else [])
+        return ": ".join([f"the process {how}"] + [line for line in said if line])
+
+    def _pass_on(self) -> None:
+        """Show what the process printed, and keep the end of it."""
+        log = self._log.fileno()
+        size = os.fstat(log).st_size
+        if size:
+            text = os.pread(log, size, 0)
+            os.truncate(log, 0)
+            os.lseek(log, 0, os.SEEK_SET)  # the process's own offset too
+            self._said = (self._said + text)[-LAST_WORDS:]
+            sys.stderr.write(text.decode(errors="replace"))
+            sys.stderr.flush()
+
+    def _kill(self) -> int:
+        """End the process and all of its group, if there is one; its exit status."""
+        process, self._process = self._process, None
+        if process is None:
+            return 0
+        self._control.close()
+        with contextlib.suppress(ProcessLookupError, PermissionError):  # they have ended
+            os.killpg(process.pid, signal.SIGKILL)
+        code = process.wait()
+        self._pass_on()
+        return code
+
+
+class InProcess:
+    """A tracker in this process: a `lae_sim.timed.TimedTracker`, for ``with``, to debug a tracker.
+
+    Nothing stops it when it hangs or crashes, and the libraries keep the threads that they were
+    imported with, but for OpenCV and torch.
+
+    Args:
+        tracker: the tracker's name, see `lae_sim.trackers.names.make_tracker`.
+        options: keyword arguments of its factory.
+        threads: threads that OpenCV and torch may use; None leaves them as they are.
+
+    Raises:
+        LaeError: if the tracker cannot be made.
+    """
+
+    def __init__(
+        self, tracker: str, options: Mapping[str, Any], threads: int | None = None
+    ) -> None:
+        self._tracker = tracker
+        self._stopwatch = Stopwatch(tracker, options, threads)
+
+    @property
+    def sets_search(self) -> bool:
+        """Whether the tracker can be told where to search."""
+        return self._stopwatch.sets_search
+
+    def init(self, frame: Image, box: Sequence[float]) -> Answer:
+        """Start on a new sequence.
+
+        Raises:
+            TrackerFailure: if the tracker raises.
+        """
+        _check_frame(frame)
+        return _answer(self._ask("init", frame, _four(box)))
+
+    def track(self, frame: Image, search: Sequence[float] | None = None) -> Answer:
+        """Find the target, around ``cx, cy, w, h`` if ``search`` is given.
+
+        Raises:
+            TrackerFailure: if the tracker raises, answers anything but a box, or has not been
+                initialised.
+        """
+        _check_frame(frame)
+        where = None if search is None else _four(search)
+        return _answer(self._ask("track", frame, where))
+
+    def describe(self) -> Mapping[str, Any]:
+        """What the tracker says of itself, and the interpreter and libraries it runs on."""
+        found: Mapping[str, Any] = self._ask("describe")
+        return found
+
+    def close(self) -> None:
+        """End the tracker."""
+        with contextlib.suppress(TrackerFailure):
+            self._ask("close")
+
+    def __enter__(self) -> InProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _ask(self, do: str, *arguments: Any) -> Any:
+        try:
+            return getattr(self._stopwatch, do)(*arguments)
+        except LaeError as error:
+            raise TrackerFailure(f"{self._tracker}: {do}: {error}") from error
+
+
+def _answer(found: dict[str, Any]) -> Answer:
+    box = found.pop("box")
+    return Answer(box=None if box is None else tuple(box), **found)
+
+
+def _check_frame(frame: Image) -> None:
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
+        raise LaeError(f"a frame is uint8 [H, W, 3], not {frame.dtype} {list(frame.shape)}")
+
+
+def _four(box: Sequence[float]) -> list[float]:
+    numbers = [float(v) for v in box]
+    if len(numbers) != 4 or not np.isfinite(numbers).all():
+        raise LaeError(f"a box is four finite numbers, not {numbers}")
+    return numbers
+
+
+def _received(control: socket.socket) -> bytes:
+    try:
+        return control.recv(65536)
+    except ConnectionError:  # it died with a question unread
+        return b""
+
+
+def _shared_file() -> IO[bytes]:
+    """A file without a name: nothing of it can be left behind."""
+    if hasattr(os, "memfd_create"):
+        return open(os.memfd_create("lae_sim frames"), "r+b", buffering=0)
+    return tempfile.TemporaryFile(buffering=0)
