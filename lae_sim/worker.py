@@ -134,6 +134,7 @@ class Worker:
                     self._process.wait(CLOSE_S)
         finally:
             self._kill()
+            self._memory = b""
             self._files.close()
 
     def __enter__(self) -> Worker:

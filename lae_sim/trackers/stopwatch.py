@@ -142,17 +142,17 @@ def _explained(call: Callable[..., Any], *arguments: Any, **options: Any) -> Any
 
 
 def _plain(output: Any) -> Any:
-    """Arrays, tensors and NumPy's numbers as lists and Python's numbers."""
+    """Arrays and tensors as lists, lists as tuples, NumPy's numbers as Python's."""
     if isinstance(output, (list, tuple)):
-        return [_plain(item) for item in output]
+        return tuple(_plain(item) for item in output)
     return output.tolist() if hasattr(output, "tolist") else output
 
 
 def _checked(output: Any) -> tuple[list[float] | None, float | None]:
-    scored = isinstance(output, list) and len(output) == 2
+    scored = isinstance(output, tuple) and len(output) == 2
     box, score = output if scored else (output, None)
     if box is not None:
-        numbers = box if isinstance(box, list) else []
+        numbers = box if isinstance(box, (list, tuple)) else ()
         if len(numbers) != 4 or not all(_is_number(v) and abs(v) <= LARGEST for v in numbers):
             raise LaeError(f"answered {repr(output)[:80]}, not a box of four finite numbers")
         box = [float(v) for v in numbers]
