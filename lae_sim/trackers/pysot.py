@@ -1,0 +1,206 @@
+"""SiamRPN++, SiamMask and their kin, from a checkout of pysot (https://github.com/STVIR/pysot).
+
+Nothing of the toolkit is part of this package: the user's own checkout is imported. Forks work that
+keep its layout: a configuration in ``core/``, in ``models/`` a ``ModelBuilder`` made without
+arguments, in ``tracker/`` a ``tracker_builder.py`` or a tracker made of the model.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from lae_sim.errors import LaeError
+from lae_sim.trackers.checkout import (
+    commit,
+    existing,
+    explained,
+    import_from,
+    replaced,
+    sha256,
+    stand_ins,
+    torch_on,
+)
+from lae_sim.trackers.protocol import Box, Image, Output
+
+# what forks import for training, drawing and logs
+_UNUSED = ("colorama", "matplotlib", "pycocotools", "tensorboardX", "tqdm", "visdom")
+
+
+class PySot:
+    """A tracker of a pysot checkout; it takes frames as OpenCV has them.
+
+    SiamMask's box is the axis-aligned one that the toolkit reports as ``bbox``; its mask and
+    polygon are computed, as the toolkit does, and dropped.
+
+    Args:
+        checkout: the folder that holds the package ``pysot``.
+        config: the ``config.yaml`` of the model.
+        snapshot: its weights, ``.pth``; read without running code from the file.
+        device: ``cpu``, ``cuda`` or ``cuda:N``.
+        model, tracker: names of classes, where a fork has several to choose from.
+
+    Raises:
+        LaeError: if one of them is missing, or they do not fit each other.
+    """
+
+    def __init__(
+        self,
+        checkout: str,
+        config: str,
+        snapshot: str,
+        device: str = "cpu",
+        model: str = "",
+        tracker: str = "",
+    ) -> None:
+        self._torch = torch_on(device)
+        self._device = device
+        self._checkout = existing(checkout, "the checkout of pysot", folder=True)
+        self._config = existing(config, "the configuration of the model")
+        self._snapshot = existing(snapshot, "the weights of the model")
+        core = _one(sorted(self._checkout.glob("*/core/config*.py")), self._checkout)
+        package = core.parent.parent
+        # forks call .cuda() whatever cfg.CUDA says; without one that is to change nothing
+        kinds = (self._torch.Tensor, self._torch.nn.Module) if device == "cpu" else ()
+        self._no_cuda = [(kind, "cuda", _itself) for kind in kinds]
+        vars(np).setdefault("float", float)  # gone in NumPy 1.24
+        vars(np).setdefault("int", int)
+        with explained(f"{self._checkout}"), stand_ins(_UNUSED), replaced(*self._no_cuda):
+            self._cfg = self._import(core).cfg
+            self._merge_config()
+            build = self._find("model", model, package, ("models/**/model_builder*.py",))
+            network = build()
+            network.load_state_dict(self._weights(network), strict=False)
+            network.eval().to(device)
+            patterns = ("tracker/tracker_builder.py", "tracker/*_tracker.py")
+            self._tracker = self._find("tracker", tracker, package, patterns)(network)
+        self._mend_opencv_test(package.name)
+
+    def init(self, frame: Image, box: Box) -> None:
+        """Start on a new sequence."""
+        with replaced(*self._no_cuda):  # of an int box the toolkit makes an int size for good
+            self._tracker.init(frame, [float(value) for value in box])
+
+    def track(self, frame: Image) -> Output:
+        """Find the target in the next frame."""
+        with replaced(*self._no_cuda):
+            found = self._tracker.track(frame)
+        box = [float(value) for value in found["bbox"]]
+        return (box, float(found["best_score"])) if "best_score" in found else box
+
+    def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
+        """Search around this centre, at this scale, next."""
+        self._tracker.center_pos = np.array([cx, cy], dtype=float)
+        self._tracker.size = np.array([w, h], dtype=float)
+
+    def sync(self) -> None:
+        """Wait for the GPU."""
+        if self._device != "cpu":
+            self._torch.cuda.synchronize()
+
+    def describe(self) -> dict[str, Any]:
+        """Name (the folder of the configuration), commit of the checkout, settings, weights."""
+        kind = type(self._tracker).__name__
+        named = self._config.parent.name
+        backbone = getattr(getattr(self._cfg, "BACKBONE", None), "TYPE", None)
+        return {
+            "name": kind if named in ("experiments", self._checkout.name) else named,
+            "version": commit(self._checkout),
+            "settings": {
+                "toolkit": "pysot",
+                "tracker": kind,
+                "backbone": backbone,
+                "device": self._device,
+                "torch_threads": self._torch.get_num_threads(),
+            },
+            "weights_digest": sha256(self._snapshot),
+            "libraries": {"torch": self._torch.__version__, "cuda": self._torch.version.cuda},
+        }
+
+    def _import(self, file: Path) -> Any:
+        parts = file.relative_to(self._checkout).with_suffix("").parts
+        return import_from(self._checkout, ".".join(parts))
+
+    def _merge_config(self) -> None:
+        try:
+            self._cfg.merge_from_file(str(self._config))
+        except KeyError as error:
+            raise LaeError(f"{self._config}: this checkout has {error.args[0]}") from error
+        self._cfg.CUDA = self._device != "cpu"
+
+    def _find(self, option: str, name: str, package: Path, patterns: Sequence[str]) -> Any:
+        """The class or function of that name, or the only one, by the first pattern with any."""
+        wanted = r"^(?:class|def) (build_tracker|\w+Tracker|ModelBuilder\w*)\b"
+        for pattern in patterns:
+            files = (f for f in sorted(package.glob(pattern)) if f.name != "base_tracker.py")
+            found = {n: f for f in files for n in re.findall(wanted, f.read_text("utf-8"), re.M)}
+            if name in found or (len(found) == 1 and not name):
+                name = name or next(iter(found))
+                return getattr(self._import(found[name]), name)
+            if found and (not name or pattern == patterns[-1]):
+                raise LaeError(f"{package}: set the option {option} to one of {', '.join(found)}")
+        raise LaeError(f"{package}: no {option} in {' or '.join(patterns)}; is it a fork of pysot?")
+
+    def _weights(self, network: Any) -> dict[str, Any]:
+        """The weights of the snapshot, if they are those of the network."""
+        torch = self._torch
+        # training snapshots hold NumPy scalars beside the weights
+        allow = getattr(torch.serialization, "safe_globals", None)
+        with (
+            explained(f"{self._snapshot}: not a snapshot"),
+            allow(_numpy_scalars()) if allow else nullcontext(),
+        ):
+            loaded = torch.load(str(self._snapshot), map_location="cpu", weights_only=True)
+            loaded = loaded.get("state_dict", loaded)
+            # DataParallel puts "module." before each name
+            weights = {re.sub("^module[.]", "", name): value for name, value in loaded.items()}
+            shapes = {name: tuple(value.shape) for name, value in weights.items()}
+        needed = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+        lacks = [n for n in needed if n not in shapes and not n.endswith("num_batches_tracked")]
+        faults = {
+            "lacks": lacks,
+            "also has": [name for name in shapes if name not in needed],
+            "has in another shape": [n for n in needed if shapes.get(n, needed[n]) != needed[n]],
+        }
+        told = [f"{fault} {len(n)} (such as {n[0]})" for fault, n in faults.items() if n]
+        if told:
+            raise LaeError(
+                f"{self._snapshot}: not weights of the model of {self._config}: "
+                f"of {len(needed)} tensors it {', '.join(told)}"
+            )
+        return weights
+
+    def _mend_opencv_test(self, package: str) -> None:
+        # SiamMask looks for a 4 at a place of the version where 3.x and 4.10 or later have none
+        module: Any = sys.modules.get(f"{package}.tracker.siammask_tracker")
+        if module is not None:
+            module.cv2 = SimpleNamespace(**{**vars(module.cv2), "__version__": "4.0.0"})
+
+
+def _one(configs: Sequence[Path], checkout: Path) -> Path:
+    if len(configs) != 1:
+        found = ", ".join(str(path.relative_to(checkout)) for path in configs) or "none"
+        raise LaeError(
+            f"{checkout}: not a checkout of pysot or a fork: looked in it for "
+            f"pysot/core/config.py, found {found}"
+        )
+    return configs[0]
+
+
+def _itself(value: Any, *args: Any, **kwargs: Any) -> Any:
+    return value
+
+
+def _numpy_scalars() -> list[Any]:
+    """What a pickled NumPy number consists of, for NumPy 1's name of it and for NumPy 2's."""
+    scalar = np.float64(0).__reduce__()[0]
+    names = [f"numpy.{core}.multiarray.scalar" for core in ("core", "_core")]
+    kinds = [type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8")]
+    return [(scalar, name) for name in names] + [np.dtype, *kinds]
