@@ -49,6 +49,15 @@ class Metadata:
         """
         schedule = {"kind": kind, **more.pop("schedule", {})}
         document = {"format": FORMAT, "version": VERSION, "fps": fps, "schedule": schedule, **more}
+        return cls.of(document)
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Metadata:
+        """Metadata from a whole document.
+
+        Raises:
+            TraceError: if a value does not fit the format.
+        """
         return cls.parse(json.dumps(document).encode())
 
     @classmethod
@@ -97,6 +106,11 @@ class Metadata:
         """The dataset's name, or ``"unknown"``."""
         dataset = self.document.get("dataset", {})
         return str(dataset.get("name", "unknown") if isinstance(dataset, dict) else dataset)
+
+    @property
+    def stride(self) -> int:
+        """Frames from one processed frame to the next, in a trace of every frame; 1 if not said."""
+        return int(self.document["schedule"].get("stride", 1))
 
     @property
     def timing_note(self) -> str | None:
@@ -149,6 +163,9 @@ def _kind(document: Mapping[str, Any]) -> str:
     kind = schedule.get("kind") if isinstance(schedule, dict) else None
     if kind not in KINDS:
         raise TraceError(f"metadata key 'schedule.kind' must be one of {', '.join(KINDS)}")
+    stride = schedule.get("stride", 1) if isinstance(schedule, dict) else 1
+    if type(stride) is not int or not 0 < stride < 2**31:
+        raise TraceError("metadata key 'schedule.stride' must be a whole number above zero")
     return str(kind)
 
 

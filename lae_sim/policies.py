@@ -34,12 +34,17 @@ def fifo(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
     return _start(clock, now, last + 1)
 
 
-def every(n: int) -> Policy:
-    """Every ``n``-th frame in order, a fixed stride; they queue if the tracker is slower."""
+def every(n: int, first: int | None = None) -> Policy:
+    """Every ``n``-th frame in order, a fixed stride; they queue if the tracker is slower.
+
+    Args:
+        n: the stride, frames.
+        first: the frame after frame 0, if not ``n``: another phase of the same stride.
+    """
 
     def fixed_stride(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         last, _, now = calls[-1]
-        return _start(clock, now, last + n)
+        return _start(clock, now, last + n if last or first is None else first)
 
     return fixed_stride
 

@@ -68,6 +68,14 @@ def parser() -> argparse.ArgumentParser:
         help="multiply all times by an exact factor, such as 2 or 1/3",
     )
     add("--timing", metavar="TRACE", help="take the times from another device's trace")
+    add(
+        "--strided",
+        nargs="+",
+        default=[],
+        metavar="TRACE",
+        help="passes on every N-th frame (lae-sim profile --stride): each box comes from the pass "
+        "that fits the frames skipped",
+    )
     scores = made.add_argument_group("forecasting and scores")
     add = scores.add_argument
     add(
@@ -131,7 +139,10 @@ def _replay(arguments: argparse.Namespace) -> None:
     arguments.forecaster = list(dict.fromkeys(arguments.forecaster))
     arguments.traces = list(dict.fromkeys(arguments.traces))
     outputs = [arguments.outputs, arguments.schedule, arguments.events, arguments.plot]
-    inputs = [*arguments.traces, *([arguments.timing] if arguments.timing else [])]
+    if arguments.strided and len(arguments.traces) > 1:
+        raise LaeError("--strided goes with one trace at a time")
+    timing = [arguments.timing] if arguments.timing else []
+    inputs = [*arguments.traces, *timing, *arguments.strided]
     check_distinct([path for path in outputs if path], inputs)
     shown = sorted({float(sigma) for sigma in arguments.sigma})
     sigmas = sorted({*arguments.sigma, *(SIGMA_GRID if arguments.sigma_grid else ())})
@@ -198,6 +209,7 @@ class _Job:
         source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
         trace = read_trace(path, arguments.sequence)
         timing = read_trace(arguments.timing) if arguments.timing else None
+        strided = [read_trace(pass_, arguments.sequence) for pass_ in arguments.strided]
         if arguments.attributes and not trace.metadata.names_attributes:
             raise LaeError(f"{path}: the trace names no attributes of its sequences")
         fps = arguments.fps or trace.metadata.fps
@@ -207,7 +219,7 @@ class _Job:
             trace=trace,
             timing=timing,
             clock=Clock.at(fps),
-            runs=lambda: replay_trace(trace, fps, source, policy, timing),
+            runs=lambda: replay_trace(trace, fps, source, policy, timing, strided),
             at_arrival=at_arrival,
             forecasters={name: load_forecaster(name) for name in ["hold", *arguments.forecaster]},
             sigmas=sigmas,
@@ -247,6 +259,7 @@ def _report(
         "tracker": metadata.tracker,
         "dataset": metadata.dataset,
         "device": metadata.device,
+        "strided": arguments.strided,
         "times_from": arguments.timing or job.path,
         "times_note": (job.timing or job.trace).metadata.timing_note,
         "fps": str(job.clock.fps),
