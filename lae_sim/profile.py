@@ -92,9 +92,9 @@ def parser() -> argparse.ArgumentParser:
     group = made.add_argument_group("the frames")
     add = group.add_argument
     add("--dataset", metavar="NAME", help="such as DTB70; found out from --root if it can be")
-    add("--root", metavar="PATH", help="folder of the dataset, or a video (default: synthetic)")
+    add("--root", type=Path, metavar="PATH", help="folder of the dataset, or a video (default: synthetic)")
     add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
-    add("--box", metavar="X,Y,W,H", help="first box, for a video")
+    add("--box", type=argument(_box), metavar="X,Y,W,H", help="first box, for a video")
     add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the dataset's)")
     group = made.add_argument_group("the run")
     add = group.add_argument
@@ -160,7 +160,9 @@ def _profile(arguments: argparse.Namespace) -> int:
     from lae_sim.journal import Journal
     from lae_sim.passes import run_pass, write_pass
 
-    dataset = find_dataset(arguments.dataset, arguments.root, arguments.sequence, arguments.box)
+    dataset = find_dataset(
+        arguments.dataset, arguments.root, arguments.sequence, arguments.box, arguments.fps
+    )
     out = _out(arguments, dataset.name)
     unfinished = out.with_suffix(".unfinished")
     if arguments.resume and out.exists() and not unfinished.exists():
@@ -254,7 +256,7 @@ def _passes(
     from lae_sim.policies import fifo
     from lae_sim.translation import Translated
 
-    clock = Clock.at(arguments.fps or dataset.fps)
+    clock = Clock.at(dataset.fps)
     policy, _ = parse_policy(arguments.policy or "latest")
     mode = arguments.mode or (
         "real-time" if arguments.policy or arguments.timing else "every-frame"
@@ -380,6 +382,14 @@ def _key_and_value(text: str) -> tuple[str, str]:
     if not (equals and key.isidentifier()):
         raise LaeError(f"{text!r} is not key=value")
     return key, value
+
+
+def _box(text: str) -> tuple[float, ...]:
+    try:
+        x, y, w, h = (float(value) for value in text.split(","))
+    except ValueError as error:
+        raise LaeError(f"{text!r} is not a box x,y,w,h in pixels") from error
+    return x, y, w, h
 
 
 def _whole(text: str, least: int = 0) -> int:
