@@ -174,8 +174,11 @@ class Worker:
                 threads=self._threads,
             )
         except TrackerFailure as error:
+            hint = ""
+            if self._process is None and self._python != sys.executable:  # it gave no answer
+                hint = f" ({self._python} must be Python 3.8 or newer with NumPy)"
             self._kill()
-            raise LaeError(str(error)) from None
+            raise LaeError(f"{error}{hint}") from None
 
     def _hand_over(self, frame: Image) -> tuple[int, ...]:
         _check_frame(frame)

@@ -28,7 +28,8 @@ class Tracker(Protocol):
 
     - ``set_search(cx, cy, w, h)``: search the next frame around this centre for a target of this
       size (float, pixels) instead of where it was last seen;
-    - ``sync()``: wait for the device to finish; the stopwatch calls it before each reading;
+    - ``sync()``: wait for the device to finish; the stopwatch calls it before each reading (for
+      torch on CUDA it does so itself);
     - ``describe() -> dict``: name, version, settings, weights_digest, libraries (JSON values);
     - ``close()``: give resources back.
     """

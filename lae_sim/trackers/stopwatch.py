@@ -42,9 +42,10 @@ _LIBRARIES = {
 class Stopwatch:
     """A tracker whose calls are timed and whose answers are checked.
 
-    The time is that of ``init`` or ``track`` alone, until the answer is numbers and, if the tracker
-    has ``sync``, its device is at rest. A frame is the tracker's own copy: it may keep it or write
-    to it. The garbage collector is left on: a tracker in use has it too, so its pauses are latency.
+    The time is that of ``init`` or ``track`` alone, from a device at rest to a device at rest: by
+    the tracker's ``sync``, or torch's for CUDA if there is none. A frame is the tracker's own copy:
+    it may keep it or write to it. The garbage collector is left on: a tracker in use has it too, so
+    its pauses are latency.
 
     Args:
         tracker: the name, see `make_tracker`.
@@ -64,7 +65,7 @@ class Stopwatch:
     ) -> None:
         self._threads = threads
         self._tracker: Any = _explained(make_tracker, tracker, options)
-        self._sync: Callable[[], object] = getattr(self._tracker, "sync", _at_rest)
+        self._sync: Callable[[], object] = getattr(self._tracker, "sync", _cuda_at_rest)
         self._started = False
         self.sets_search = hasattr(self._tracker, "set_search")
         self._limit_threads()
@@ -87,32 +88,35 @@ class Stopwatch:
                 raise LaeError("the tracker cannot be told where to search: it has no set_search")
             _explained(self._tracker.set_search, *search)
         output, elapsed_ns, cpu_ns = _explained(self._timed, self._tracker.track, frame.copy())
-        box, score = _checked(output)
+        box, score = _checked(_explained(_plain, output))
         self._started = True
         return {"box": box, "score": score, "elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns}
 
     def describe(self) -> dict[str, Any]:
         """What the tracker says of itself, and its interpreter and libraries, as JSON values."""
-        own = _explained(getattr(self._tracker, "describe", dict))
+        found: dict[str, Any] = _explained(self._description)
+        return found
+
+    def close(self) -> None:
+        """Have the tracker give its resources back."""
+        _explained(getattr(self._tracker, "close", int))
+
+    def _description(self) -> Any:
+        own: Mapping[str, Any] = getattr(self._tracker, "describe", dict)()
         found = {
             **own,
             "python": platform.python_version(),
             "libraries": {**_versions(), **own.get("libraries", {})},
             "threads": _threads(),
-            "synchronised": self._sync is not _at_rest,
+            "synchronised": self._sync is not _cuda_at_rest or _torch_on_cuda() is not None,
             **_cuda(),
         }
-        plain: dict[str, Any] = json.loads(_explained(json.dumps, found, default=_text))
-        return plain
-
-    def close(self) -> None:
-        """Have the tracker give its resources back."""
-        _explained(getattr(self._tracker, "close", _at_rest))
+        return json.loads(json.dumps(found, default=_text))
 
     def _timed(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, int, int]:
         self._sync()
         cpu, start = process_time_ns(), perf_counter_ns()
-        output = _plain(call(*arguments))  # an answer still being computed on a device waits here
+        output = call(*arguments)
         self._sync()
         return output, perf_counter_ns() - start, process_time_ns() - cpu
 
@@ -124,8 +128,15 @@ class Stopwatch:
             torch.set_num_threads(self._threads)
 
 
-def _at_rest() -> None:
-    pass
+def _torch_on_cuda() -> Any:
+    torch = sys.modules.get("torch")
+    return torch if torch and torch.cuda.is_initialized() else None
+
+
+def _cuda_at_rest() -> None:
+    torch = _torch_on_cuda()
+    if torch:
+        torch.cuda.synchronize()
 
 
 def _explained(call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
@@ -187,7 +198,7 @@ def _cuda() -> dict[str, Any]:
     if not torch or not torch.version.cuda:
         return {}
     found = {"cuda": torch.version.cuda, "cudnn": torch.backends.cudnn.version()}
-    if torch.cuda.is_initialized():
+    if _torch_on_cuda():
         found["gpu"] = torch.cuda.get_device_name()
     return found
 

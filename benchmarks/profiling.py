@@ -1,0 +1,96 @@
+"""What timing a tracker costs: ``python benchmarks/profiling.py``.
+
+The tracker works for 5 ms and notes how long that took, so that what the stopwatch reads beyond it
+is known for each frame, on a busy machine too. The rest of the round trip, in which frames are
+handed over, is outside of what is measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lae_sim.report import table
+from lae_sim.timed import TimedTracker
+from lae_sim.trackers.protocol import Image
+from lae_sim.worker import InProcess, Worker
+
+WORK_NS = 5_000_000
+SIZES = ((640, 480), (1920, 1080))
+
+
+class Busy:
+    """A tracker that works for 5 ms; its score is how many nanoseconds it really took."""
+
+    def init(self, frame: Image, box: Sequence[float]) -> None:
+        """Remember nothing."""
+
+    def track(self, frame: Image) -> tuple[Sequence[float], float]:
+        """Work without rest."""
+        start = now = time.perf_counter_ns()
+        while now - start < WORK_NS:
+            now = time.perf_counter_ns()
+        return (1.0, 2.0, 3.0, 4.0), float(now - start)
+
+
+def medians(tracker: TimedTracker, frame: Image, calls: int) -> tuple[float, float, float]:
+    """Median ns of a round trip, of the work, and of what the stopwatch reads beyond the work."""
+    tracker.init(frame, (1, 2, 3, 4))
+    found = []
+    for _ in range(calls):
+        start = time.perf_counter_ns()
+        answer = tracker.track(frame)
+        end = time.perf_counter_ns()
+        assert answer.score
+        found.append((end - start, answer.score, answer.elapsed_ns - answer.score))
+    trips, works, beyond = zip(*found)
+    return statistics.median(trips), statistics.median(works), statistics.median(beyond)
+
+
+def lines(calls: int) -> list[list[str]]:
+    """Table lines for each frame size, in a worker process and in this one."""
+    os.chdir(Path(__file__).parent)  # where the worker finds this module
+    found = []
+    kinds = {"worker process": Worker, "in this process": InProcess}
+    for width, height in SIZES:
+        frame = np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
+        copies = [copy_ns(frame) for _ in range(21)]
+        copy = statistics.median(copies)
+        for name, kind in kinds.items():
+            with kind("profiling:Busy", {}) as tracker:
+                trip, work, beyond = medians(tracker, frame, calls)
+            around = trip - work - beyond
+            what = f"{width}x{height}, {name}"
+            found += [
+                [what, "round trip", f"{trip / 1e6:.3f} ms", f"{trip / work:.4f}", ""],
+                [what, "in the time measured", f"{beyond / 1e3:.1f} us"]
+                + [f"{beyond / work:.4f}", "<= 0.01"],
+                [what, "around it", f"{around / 1e3:.0f} us", f"{around / work:.4f}", ""],
+                [what, "(one copy of the frame)", f"{copy / 1e3:.0f} us", f"{copy / work:.4f}", ""],
+            ]
+    return found
+
+
+def copy_ns(frame: Image) -> int:
+    """How long one copy of a frame takes, in ns."""
+    start = time.perf_counter_ns()
+    frame.copy()
+    return time.perf_counter_ns() - start
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--calls", type=int, default=400, help="of the tracker (default: 400)")
+    found = lines(parser.parse_args().calls)
+    print(table(["5 ms tracker", "what", "median", "ratio to the work", "target"], found))
+
+
+if __name__ == "__main__":
+    main()
