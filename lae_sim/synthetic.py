@@ -1,0 +1,365 @@
+"""An embedded dataset: targets filmed from a UAV, drawn on demand.
+
+It needs no download, so a tracker can be tried and a device profiled anywhere. Every motion is a
+sum of sines of time, so any frame can be drawn alone and in any order, and the ground truth is
+exact. Motion blur is a mean over the exposure, so it follows each thing's apparent motion. The
+same seed gives the same pixels with the same OpenCV and NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import numpy as np
+
+from lae_sim.boxes import Floats
+from lae_sim.errors import LaeError
+from lae_sim.frames import Dataset, Image, ImageSequence
+from lae_sim.textures import TILE, ground, sprite, tree
+
+_SIZE = np.array([640.0, 360.0])
+_CENTRE = (_SIZE - 1) / 2
+_MARGIN = 700  # the ground is repeated so far beyond its tile; reaches any corner of the image
+_EXPOSURES = 4  # moments averaged over an exposure
+_OUTLINE = np.linspace(0, 2 * np.pi, 128, endpoint=False)
+_NOISE = 6.0  # sensor noise, standard deviation in levels
+
+Sines = Callable[[Floats], Floats]
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What makes a sequence hard; lengths in pixels, angles in radians, times in frames.
+
+    Attributes:
+        name, seed, frames: of the sequence.
+        size, aspect, corner: the target's length, its width over its length, and the exponent of
+            its outline, a superellipse (2 is an ellipse, 6 nearly a rectangle).
+        colour: blue, green, red of the target.
+        speed, reach: root mean square speed of the target in the image without shake, and how much
+            of the image its path covers; above 1 it leaves the image.
+        flight, shake: the camera's speed over the ground, and rms speed of its shake.
+        zoom, spin: amplitudes of the logarithm of the scale, and of the camera's rotation.
+        turn, gait: how far the target turns sideways (1 is out of sight), and deforms.
+        rivals, covers: numbers of look-alikes, and of trees that it passes under.
+        exposure: share of the time between two frames.
+        light: amplitude of the logarithm of the brightness.
+        clutter: number of things of the target's colour on each tile of the ground.
+    """
+
+    name: str
+    seed: int = 0
+    frames: int = 160
+    size: float = 52
+    aspect: float = 0.5
+    corner: float = 5
+    colour: tuple[int, int, int] = (50, 50, 185)
+    speed: float = 5
+    reach: float = 0.75
+    flight: float = 7
+    shake: float = 0.8
+    zoom: float = 0.12
+    spin: float = 0.15
+    turn: float = 0
+    gait: float = 0
+    rivals: int = 0
+    covers: int = 0
+    exposure: float = 0
+    light: float = 0.05
+    clutter: int = 0
+
+
+_SCENES = (
+    _Scene("boat", size=64, aspect=0.36, corner=2.5, colour=(190, 200, 205), zoom=0.5, spin=0.4),
+    _Scene("bus", size=96, aspect=0.3, colour=(40, 150, 200), covers=2, speed=4, shake=1.5),
+    _Scene("car", covers=3, spin=0.5),
+    _Scene("chase", colour=(60, 60, 60), rivals=3, speed=5.5, clutter=25),
+    _Scene("cyclist", size=40, aspect=0.45, corner=2.5, gait=0.3, zoom=0.35, speed=5, shake=2),
+    _Scene(
+        "drone", size=36, aspect=0.9, corner=3, colour=(70, 60, 60), speed=9, shake=3, light=0.3
+    ),
+    _Scene("herd", size=34, aspect=0.5, corner=2.3, colour=(70, 95, 120), gait=0.25, rivals=4),
+    _Scene("race", colour=(40, 160, 215), speed=8, flight=14, shake=4, exposure=0.6, spin=0.5),
+    _Scene("runner", size=30, aspect=0.6, corner=2.2, gait=0.4, covers=2, clutter=40, speed=4),
+    _Scene("skater", size=44, aspect=0.55, corner=2.3, gait=0.35, turn=0.45, speed=6, spin=0.9),
+    _Scene("truck", size=70, aspect=0.42, colour=(170, 120, 50), reach=1.05, zoom=0.3, speed=6),
+    _Scene("van", size=58, colour=(200, 205, 210), turn=0.35, zoom=0.45, exposure=0.4, shake=4),
+)
+
+
+def synthetic_dataset(seed: int = 0) -> Dataset:
+    """Twelve sequences of 160 frames, 640 x 360 pixels, at 30 frames per second.
+
+    Nothing is drawn before a frame is read. Attributes have DTB70's names, and are what the scenes
+    show. The truth is the box of the whole target, also where a tree hides it; NaN where less than
+    a quarter of the box is in the image.
+
+    Args:
+        seed: another seed gives other paths and textures of about the same difficulty.
+    """
+    scenes = (replace(scene, seed=seed) for scene in _SCENES)
+    return Dataset("synthetic", Fraction(30), [_sequence(scene) for scene in scenes])
+
+
+def _sequence(scene: _Scene) -> ImageSequence:
+    path = _Path(scene)
+    time = np.arange(scene.frames, dtype=np.float64)
+    truth = path.boxes(time)
+    corners = np.clip(truth[:, None, :2] + truth[:, None, 2:] * [[0], [1]], 0, _SIZE)
+    visible = (corners[:, 1] - corners[:, 0]).prod(axis=1) / truth[:, 2:].prod(axis=1)
+    attributes = _attributes(scene, path, truth, visible)
+    truth[visible < 0.25] = np.nan
+    return ImageSequence(scene.name, truth, partial(_read, scene), attributes)
+
+
+def _attributes(scene: _Scene, path: _Path, truth: Floats, visible: Floats) -> tuple[str, ...]:
+    """DTB70's names for what a scene shows."""
+    time = np.arange(scene.frames, dtype=np.float64)
+    area = truth[:, 2:].prod(axis=1)
+    ratio = truth[:, 2] / truth[:, 3] * (truth[0, 3] / truth[0, 2])
+    angle = np.unwrap(path.angle(time))
+    shown = {
+        "Scale variation": area.max() / area.min() > 2.5,
+        "Aspect ratio variation": max(ratio.max(), 1 / ratio.min()) > 2,
+        "Occlusion": scene.covers > 0,
+        "Deformation": scene.gait > 0,
+        "Fast camera motion": scene.shake >= 3 or scene.flight > 10,
+        "In-plane rotation": np.ptp(angle) > np.pi / 2,
+        "Out-of-plane rotation": scene.turn > 0,
+        "Out-of-view": visible.min() < 0.5,
+        "Background clutter": scene.clutter > 0,
+        "Similar objects around": scene.rivals > 0,
+        "Motion blur": scene.exposure > 0,
+    }
+    return tuple(name for name, holds in shown.items() if holds)
+
+
+class _Path:
+    """Where everything is at any times; arrays are [n, ...] for n times."""
+
+    def __init__(self, scene: _Scene) -> None:
+        rng = _rng(scene, "path")
+        self.scene = scene
+        rates = np.array([[1.0, 2.9], [1.45, 3.7]]) * rng.uniform(0.85, 1.15, (2, 2))
+        reach = scene.reach / 2 * _SIZE[:, None] * [[0.8, 0.2], [0.75, 0.25]]
+        rates *= scene.speed / np.sqrt((reach**2 * rates**2).sum() / 2)
+        middle = rng.choice([0, np.pi], (2, 1)) + rng.uniform(-0.5, 0.5, (2, 2))
+        self._across = _sines(rates, reach, middle)
+        rates = rng.uniform(0.2, 0.6, (2, 5))
+        self._shake = _sines(rates, scene.shake * np.sqrt(0.2) / rates, _phases(rng, 2, 5))
+        heading = rng.uniform(0, 2 * np.pi)
+        self._flight = scene.flight * np.array([np.cos(heading), np.sin(heading)])
+        self._start = rng.uniform(0, TILE, 2)
+        rates = rng.uniform(0.02, 0.05, (2, 2))
+        self._drift = _sines(rates, np.full((2, 2), 25.0), _phases(rng, 2, 2))
+        self.light = _slow(rng, scene.light)
+        self._zoom, self._spin, self._yaw = (
+            _slow(rng, amplitude) for amplitude in (scene.zoom, scene.spin, 0.1)
+        )
+        self._gait, self._turn = rng.uniform(0, 6, 2)
+        self._rivals = [
+            _sines(
+                rng.uniform(0.035, 0.09, (2, 2)),
+                scene.size * np.array([[1.5, 0.8], [1.2, 0.8]]),
+                _phases(rng, 2, 2),
+            )
+            for _ in range(scene.rivals)
+        ]
+        # A tree stands where the target is fastest over the ground: it must come out again.
+        time = np.arange(0.2 * scene.frames, scene.frames - 10)
+        speed = np.hypot(*(self.on_ground(time + 1) - self.on_ground(time)).T)
+        parts = np.array_split(np.arange(len(time)), max(scene.covers, 1))[: scene.covers]
+        under = time[[part[np.argmax(speed[part])] for part in parts]]
+        self.covers = self.on_ground(under)
+        self.crowns = scene.size * rng.uniform(1.2, 1.8, scene.covers)
+
+    def side(self, time: Floats) -> Floats:
+        """How much of the target's side shows, 0 to ``turn``."""
+        return np.asarray(self.scene.turn * (0.5 - 0.5 * np.cos(0.06 * time + self._turn)), float)
+
+    def camera(self, time: Floats) -> tuple[Floats, Floats, Floats]:
+        """Ground to image: matrices [n, 2, 2], the ground's point [n, 2] at the image's [n, 2]."""
+        angle = self._spin(time)
+        matrix = np.exp(self._zoom(time))[:, None, None] * _rotation(angle)
+        there = self._start + self._flight * time[:, None] + self._drift(time)
+        return matrix, there, _CENTRE + self._shake(time)
+
+    def on_ground(self, time: Floats, rival: int | None = None) -> Floats:
+        """The target's, or a rival's, place on the ground, [n, 2]."""
+        matrix, there, _ = self.camera(time)
+        across = self._across(time)
+        if rival is not None:
+            across = across + self._rivals[rival](time)
+        return np.asarray(there + np.einsum("nij,nj->ni", np.linalg.inv(matrix), across), float)
+
+    def angle(self, time: Floats) -> Floats:
+        """The direction in the image in which the target moves over the ground."""
+        ahead, behind = self.on_ground(time + 3), self.on_ground(time - 3)
+        x, y = (ahead - behind).T
+        return np.asarray(np.arctan2(y, x) + self._spin(time) + self._yaw(time), np.float64)
+
+    def target(self, time: Floats, rival: int | None = None) -> tuple[Floats, Floats]:
+        """Target to image: matrices [n, 2, 2], and its middle in the image [n, 2]."""
+        matrix, there, here = self.camera(time)
+        place = here + np.einsum("nij,nj->ni", matrix, self.on_ground(time, rival) - there)
+        phase = 0.55 * time + self._gait + 2.0 * (rival or 0)
+        shape = np.zeros((len(time), 2, 2))
+        shape[:, 0, 0] = 1 + 0.5 * self.scene.gait * np.sin(phase)
+        shape[:, 0, 1] = self.scene.gait * np.sin(phase + 1)
+        shape[:, 1, 1] = 1 - self.side(time)
+        zoom = np.exp(self._zoom(time))[:, None, None]
+        return zoom * _rotation(self.angle(time)) @ shape, place
+
+    def boxes(self, time: Floats) -> Floats:
+        """The boxes ``x, y, w, h`` around the target's outline, [n, 4]."""
+        matrix, place = self.target(time)
+        x, y = np.cos(_OUTLINE), np.sin(_OUTLINE)
+        radius = (np.abs(x) ** self.scene.corner + np.abs(y) ** self.scene.corner) ** (
+            -1 / self.scene.corner
+        )
+        half = np.array([1, self.scene.aspect])[:, None] * self.scene.size / 2
+        outline = matrix @ (half * radius * np.stack([x, y])) + place[..., None]
+        least, most = outline.min(axis=2), outline.max(axis=2)
+        return np.concatenate([least + 0.5, most - least], axis=1)  # pixel 0 covers 0 to 1
+
+
+class _Layer(NamedTuple):
+    """A picture, its alpha multiplied in, and where it is at each of n moments."""
+
+    picture: Image
+    matrix: Floats  # picture to image, [n, 2, 2]
+    place: Floats  # of the picture's middle, [n, 2]
+    opacity: Floats | float = 1.0
+
+
+class _Film:
+    """A scene ready to be drawn: its textures, and all motions at all moments."""
+
+    def __init__(self, scene: _Scene) -> None:
+        self._scene = scene
+        self._steps = _EXPOSURES if scene.exposure else 1
+        within = (np.arange(self._steps) + 0.5) / self._steps - 0.5
+        time = (np.arange(scene.frames)[:, None] + scene.exposure * within).ravel()
+        path, rng = _Path(scene), _rng(scene, "textures")
+        tile = ground(rng, scene.colour, scene.clutter)
+        self._ground = np.pad(tile, [(_MARGIN, _MARGIN), (_MARGIN, _MARGIN), (0, 0)], "wrap")
+        noise = rng.normal(32, _NOISE, (540, 960, 3))
+        self._noise = np.clip(noise, 0, 64).astype(np.uint8)
+        matrix, there, here = path.camera(time)
+        inverse = np.linalg.inv(matrix)
+        corner = there % TILE + _MARGIN - np.einsum("nij,nj->ni", inverse, here)
+        self._views = np.concatenate([inverse, corner[..., None]], axis=2)
+        self._gain = np.exp(path.light(time))
+        self._layers: list[_Layer] = []
+        pattern = rng.integers(1 << 32)
+        for number in [*range(scene.rivals), None]:
+            shift = 0 if number is None else rng.normal(0, 12, 3)
+            moved, place = path.target(time, number)
+            body, side = (
+                sprite(
+                    np.random.default_rng(pattern + look),
+                    (scene.size, scene.size * scene.aspect),
+                    scene.corner,
+                    np.array(scene.colour) * (1 - 0.3 * look) + shift,
+                )
+                for look in (0, 1)
+            )
+            shadow = body * np.array([0, 0, 0, 1], np.uint8)
+            below = place + 0.06 * scene.size * matrix.sum(axis=2)
+            self._layers += [_Layer(shadow, moved, below, 0.45), _Layer(body, moved, place)]
+            if scene.turn:
+                self._layers.append(_Layer(side, moved, place, path.side(time)))
+        for where, width in zip(path.covers, path.crowns):
+            crown = tree(rng, 160)
+            place = here + np.einsum("nij,nj->ni", matrix, where - there)
+            self._layers.append(_Layer(crown, matrix * width / (0.8 * len(crown)), place))
+
+    def draw(self, frame: int) -> Image:
+        """A frame, uint8 [360, 640, 3]."""
+        import cv2
+
+        moments = range(frame * self._steps, (frame + 1) * self._steps)
+        if self._steps == 1:
+            image = self._snapshot(frame, cv2.INTER_LINEAR)
+        else:
+            total = np.zeros((*_SIZE[::-1].astype(int), 3), np.float32)
+            for moment in moments:
+                cv2.accumulate(self._snapshot(moment, cv2.INTER_NEAREST), total)
+            image = np.asarray(cv2.convertScaleAbs(total, alpha=1 / self._steps), np.uint8)
+        y, x = _rng(self._scene, f"noise {frame}").integers(0, (180, 320))
+        noise = self._noise[y : y + 360, x : x + 640]
+        gain = float(self._gain[moments[self._steps // 2]])
+        return np.asarray(cv2.addWeighted(image, gain, noise, 1, -32), np.uint8)
+
+    def _snapshot(self, moment: int, flags: int) -> Image:
+        import cv2
+
+        size = _SIZE.astype(int).tolist()
+        flags |= cv2.WARP_INVERSE_MAP
+        view = self._views[moment]
+        image = np.asarray(cv2.warpAffine(self._ground, view, size, flags=flags), np.uint8)
+        for layer in self._layers:
+            picture, opacity = layer.picture, np.broadcast_to(layer.opacity, len(self._gain))
+            if opacity[moment] < 1:
+                faded = cv2.convertScaleAbs(picture, alpha=float(opacity[moment]))
+                picture = np.asarray(faded, np.uint8)
+            _draw(image, picture, layer.matrix[moment], layer.place[moment])
+        return image
+
+
+@lru_cache(maxsize=1)  # 25 MB a scene; sequences are read one after the other
+def _film(scene: _Scene) -> _Film:
+    return _Film(scene)
+
+
+def _read(scene: _Scene, frame: int) -> Image:
+    if not 0 <= frame < scene.frames:
+        raise LaeError(f"sequence {scene.name!r} has no frame {frame}")
+    return _film(scene).draw(frame)
+
+
+def _draw(image: Image, picture: Image, matrix: Floats, place: Floats) -> None:
+    """Draw a picture with its middle at a place of the image."""
+    import cv2
+
+    middle = (np.array(picture.shape[1::-1]) - 1) / 2
+    reach = np.abs(matrix) @ (middle + 1)
+    low = np.clip(np.floor(place - reach), 0, _SIZE).astype(int)
+    high = np.clip(np.ceil(place + reach) + 1, 0, _SIZE).astype(int)
+    if (high <= low).any():
+        return
+    view = np.column_stack([matrix, place - matrix @ middle - low])
+    drawn = np.asarray(cv2.warpAffine(picture, view, (high - low).tolist(), flags=cv2.INTER_LINEAR))
+    part = image[low[1] : high[1], low[0] : high[0]]
+    under = cv2.merge([255 - drawn[..., 3]] * 3)
+    part[:] = cv2.add(cv2.multiply(part, under, scale=1 / 255), drawn[..., :3])
+
+
+def _rng(scene: _Scene, use: str) -> np.random.Generator:
+    """A stream of its own for each sequence and use, whichever is drawn first."""
+    return np.random.default_rng([scene.seed, *f"{scene.name} {use}".encode()])
+
+
+def _sines(rates: Floats, amplitudes: Floats, phases: Floats) -> Sines:
+    """Sums of sines over the last axis: times [n] to values [n, ...]."""
+    rank = (slice(None), *[None] * rates.ndim)
+    return lambda time: (amplitudes * np.sin(rates * time[rank] + phases)).sum(axis=-1)
+
+
+def _phases(rng: np.random.Generator, *shape: int) -> Floats:
+    return rng.uniform(0, 2 * np.pi, shape)
+
+
+def _slow(rng: np.random.Generator, amplitude: float) -> Sines:
+    """A slow change of a number."""
+    return _sines(rng.uniform(0.02, 0.06, 2), np.array([0.65, 0.35]) * amplitude, _phases(rng, 2))
+
+
+def _rotation(angle: Floats) -> Floats:
+    """Rotation matrices [n, 2, 2]."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([cosine, -sine], -1), np.stack([sine, cosine], -1)], -2)
