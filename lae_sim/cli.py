@@ -15,6 +15,7 @@ from lae_sim.errors import LaeError
 COMMANDS = {
     "convert": "make a trace from results that a tracker left (boxes and times)",
     "replay": "replay traces and score them, latency counted",
+    "show": "say what a trace holds: provenance, times, stalls, drift",
 }
 
 Parsed = TypeVar("Parsed")
