@@ -1,0 +1,251 @@
+"""Any program that speaks TraX, the protocol of the VOT challenge (extra ``trax``).
+
+L. Čehovin, "TraX: The visual Tracking eXchange protocol and library", Neurocomputing 260 (2017).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import glob
+import os
+import select
+import shlex
+import shutil
+import socket
+import struct
+import subprocess
+import tempfile
+import weakref
+from typing import Any
+
+import numpy as np
+
+from lae_sim.errors import LaeError
+from lae_sim.trackers.protocol import Box, Image, Output
+
+SHARED_MEMORY = "/dev/shm"
+ROOM = 2**28
+FOLDER = "lae-sim-trax-"
+PATIENCE_S = 1.0
+
+
+class Trax:
+    """A program that speaks TraX, on whatever interpreter and libraries it is started with.
+
+    Frames are handed over as BMP files in shared memory; the time of a call includes writing and
+    reading one. The program stays over sequences. One that ends with its first, as those made with
+    the VOT wrapper do, is started again for each, by `prepare`. That wrapper also answers before
+    its tracker has seen the first frame, so ``init`` has it track that frame once.
+
+    Args:
+        command: the program and its arguments, as in a shell but without one; ``env X=1 command``
+            sets a variable.
+        parameters: given to the program at each initialisation, as text.
+
+    Raises:
+        LaeError: if the command does not start, or ends without speaking TraX; by each method, if
+            the program ends. The next ``init`` then starts it again.
+    """
+
+    def __init__(self, command: str, **parameters: Any) -> None:
+        try:
+            import trax
+            import trax.client
+        except ImportError as error:
+            raise LaeError(f"TraX is missing ({error}): pip install 'lae-sim[trax]'") from error
+        self._trax: Any = trax
+        self._command = command
+        self._parameters = {name: str(value) for name, value in parameters.items()}
+        self._client: Any = None
+        self._fresh, self._lasting = False, True
+        self._session, files = contextlib.ExitStack(), contextlib.ExitStack()
+        self._folder = files.enter_context(_folder())
+        files.callback(self._session.close)
+        self._close = weakref.finalize(self, files.close)
+        self._bitmaps: list[tuple[str, Any]] = []
+        self._shape: tuple[int, ...] = ()
+        try:
+            self.prepare()
+        except BaseException:
+            self.close()
+            raise
+
+    def prepare(self) -> None:
+        """Start the program unless it is ready for ``init``, which does it too but is timed."""
+        if self._client is None or not (self._fresh or self._lasting):
+            self._end()
+            self._start()
+
+    def init(self, frame: Image, box: Box) -> None:
+        """Start on a new sequence."""
+        self.prepare()
+        fresh, self._fresh = self._fresh, False
+        region = self._trax.Rectangle.create(*box)
+        images = self._hand_over(frame)
+        try:
+            self._ask(self._client.initialize, images, [(region, {})], self._parameters)
+        except LaeError:
+            if fresh:
+                raise
+            self.init(frame, box)
+            self._lasting = False  # what a new process does, the old one could not
+            return
+        if self._wrapped:
+            self._ask(self._client.frame, images, {}, [])
+
+    def track(self, frame: Image) -> Output:
+        """Find the target in the next frame."""
+        if self._client is None:
+            raise LaeError(f"trax:{self._command} must be initialised first")
+        region, properties = self._ask(self._client.frame, self._hand_over(frame), {}, [])
+        box = _box(region)
+        try:
+            return box and (box, float(properties["confidence"]))
+        except (KeyError, ValueError):
+            return box
+
+    def describe(self) -> dict[str, Any]:
+        """What the program told of itself, and how it was started."""
+        from importlib.metadata import version
+
+        return {
+            **self._told,
+            "settings": {"command": self._command, **self._parameters},
+            "libraries": {"trax": version("vot-trax")},
+        }
+
+    def close(self) -> None:
+        """End the program."""
+        self._end()
+        self._bitmaps, self._shape = [], ()
+        self._close()
+
+    def _start(self) -> None:
+        with socket.socket() as listener:  # not its standard output, on which it may print
+            listener.bind(("127.0.0.1", 0))
+            listener.listen(1)
+            port = str(listener.getsockname()[1])
+            self._log = self._session.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
+            try:
+                self._process = subprocess.Popen(
+                    shlex.split(self._command),
+                    stdin=subprocess.DEVNULL,
+                    stdout=self._log,
+                    stderr=self._log,
+                    env={**os.environ, "TRAX": "1", "TRAX_SOCKET": port},
+                )
+            except (OSError, ValueError, IndexError) as error:
+                raise LaeError(f"trax:{self._command} does not start: {error}") from error
+            self._session.callback(_end, self._process)
+            while not select.select([listener], [], [], 0.05)[0]:
+                if self._process.poll() is not None:
+                    raise self._failure("it did not speak TraX")
+            try:
+                client = self._trax.client.Client(listener.fileno(), log=str)
+            except self._trax.TraxException as error:
+                raise self._failure(str(error)) from error
+        self._session.callback(client.quit)  # without it, the library's own clean-up crashes
+        self._client, self._fresh = client, True
+        self._wrapped = client.get("vot") is not None
+        self._lasting = self._lasting and not self._wrapped
+        told = {key: getattr(client, "tracker_" + key) for key in ("name", "family", "description")}
+        self._told = {key: text for key, text in told.items() if text}
+
+    def _hand_over(self, frame: Image) -> dict[str, Any]:
+        """The frame as the program takes it; a file stays as it is until the frame after next."""
+        if self._trax.Image.PATH not in self._client.image_formats:
+            return {"color": self._trax.MemoryImage.create(frame[:, :, ::-1])}
+        if frame.shape != self._shape:
+            paths = [os.path.join(self._folder, name) for name in ("even.bmp", "odd.bmp")]
+            self._bitmaps = [(path, _bitmap(path, *frame.shape[:2])) for path in paths]
+            self._shape = frame.shape
+        self._bitmaps.reverse()
+        path, rows = self._bitmaps[0]
+        rows[:] = frame.reshape(rows.shape)
+        return {"color": self._trax.FileImage.create(path)}
+
+    def _ask(self, call: Any, *arguments: Any) -> tuple[Any, dict[str, str]]:
+        """The first region, and its properties, that the program answers with."""
+        try:
+            objects, _ = call(*arguments)
+            if not objects:
+                raise self._trax.TraxException("no answer")
+        except self._trax.TraxException as error:
+            raise self._failure(str(error)) from error
+        except BaseException:  # the answer would be taken for that of the next call
+            self._end()
+            raise
+        found: tuple[Any, dict[str, str]] = objects[0]
+        return found
+
+    def _failure(self, reason: str) -> LaeError:
+        """End the program; why."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            reason = f"it ended with status {self._process.wait(PATIENCE_S)} ({reason})"
+        self._log.seek(max(self._log.seek(0, os.SEEK_END) - 1000, 0))
+        lines = self._log.read().decode(errors="replace").split("\n")
+        said = [line.strip() for line in lines if line.strip()]
+        self._end()
+        return LaeError(": ".join([f"trax:{self._command}", reason, *said[-1:]]))
+
+    def _end(self) -> None:
+        self._client = None
+        self._session.close()
+
+
+def _bitmap(path: str, height: int, width: int) -> Any:
+    """Make a BMP file; its rows from the top, uint8 [height, 3 * width], to write frames to."""
+    stride = (3 * width + 3) // 4 * 4
+    file: Any = np.memmap(path, np.uint8, "w+", shape=(54 + height * stride,))
+    sizes = file.size, 0, 54, 40, width, height, 1, 24, 0, height * stride, 2835, 2835, 0, 0
+    file[:54] = np.frombuffer(b"BM" + struct.pack("<IIIIiiHHIIiiII", *sizes), np.uint8)
+    return file[54:].reshape(height, stride)[::-1, : 3 * width]
+
+
+def _box(region: Any) -> tuple[float, float, float, float] | None:
+    """The box around a region; None for one that is empty or special."""
+    if region.type == "rectangle":
+        x, y, w, h = region.bounds()
+    elif region.type == "polygon":
+        points = np.array(list(region))
+        (x, y), (w, h) = points.min(axis=0), np.ptp(points, axis=0)
+    elif region.type == "mask" and region.array().any():
+        rows, columns = np.nonzero(region.array())
+        left, top = region.offset()
+        x, y = left + columns.min(), top + rows.min()
+        w, h = np.ptp(columns) + 1, np.ptp(rows) + 1
+    else:
+        return None
+    return (float(x), float(y), float(w), float(h)) if w > 0 and h > 0 else None
+
+
+@contextlib.contextmanager
+def _folder() -> Any:
+    """A folder in shared memory; those of processes that were killed are removed."""
+    shared = os.path.isdir(SHARED_MEMORY) and shutil.disk_usage(SHARED_MEMORY).free > ROOM
+    parent = SHARED_MEMORY if shared else tempfile.gettempdir()
+    for old in glob.glob(os.path.join(parent, FOLDER + "*")):
+        with contextlib.suppress(OSError), _locked(old):
+            shutil.rmtree(old)
+    with tempfile.TemporaryDirectory(prefix=FOLDER, dir=parent) as made, _locked(made):
+        yield made
+
+
+@contextlib.contextmanager
+def _locked(folder: str) -> Any:
+    """Hold a folder's lock, which the kernel gives back if the process is killed."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Wait a moment for a process that was told to end, then kill it."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(PATIENCE_S)
+    process.kill()
+    process.wait()
