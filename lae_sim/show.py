@@ -14,6 +14,7 @@ from lae_sim.cli import exit_status
 if TYPE_CHECKING:
     from lae_sim.metadata import Metadata
     from lae_sim.timing import SequenceTimes
+    from lae_sim.trace import Trace
 
 Report = dict[str, Any]
 
@@ -59,12 +60,13 @@ def _show(arguments: argparse.Namespace) -> None:
         check_format(arguments.plot)
     reports, times = [], []
     for number, path in enumerate(arguments.traces):
+        trace = read_trace(path)
         if arguments.metadata:
-            document = read_trace(path).metadata.document
+            document = trace.metadata.document
             print(json.dumps(document, indent=2, ensure_ascii=False))
         if arguments.metadata and not arguments.plot:
             continue
-        report, sequences = describe(path)
+        report, sequences = describe(trace, path)
         reports.append(report)
         times.append(sequences if arguments.plot else [])
         if not arguments.json and not arguments.metadata:
@@ -76,8 +78,12 @@ def _show(arguments: argparse.Namespace) -> None:
         _plot(reports, times, arguments.plot)
 
 
-def describe(path: str) -> tuple[Report, list[SequenceTimes]]:
+def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
     """What ``--json`` prints of a trace, and its times in the order in which they were taken.
+
+    Args:
+        trace: the trace; it is read once.
+        path: the file that it is from.
 
     Raises:
         TraceError: if it is not a valid trace.
@@ -85,9 +91,7 @@ def describe(path: str) -> tuple[Report, list[SequenceTimes]]:
     import numpy as np
 
     from lae_sim import timing
-    from lae_sim.trace import read_trace
 
-    trace = read_trace(path)
     metadata = trace.metadata
     entries = metadata.document.get("sequences", {})
     sequences, frames, with_truth, sizes = [], 0, 0, Counter[str]()
