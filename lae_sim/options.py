@@ -1,19 +1,49 @@
-"""Policies, latency sources and forecasters by the names that command lines use."""
+"""The options of a replay: policies, latency sources and forecasters by name."""
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import sys
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.clock import parse_duration
+from lae_sim.cli import argument
+from lae_sim.clock import parse_duration, parse_fps, parse_rational
 from lae_sim.errors import LaeError
 
 if TYPE_CHECKING:
     from lae_sim.engine import Policy
     from lae_sim.forecast import ForecasterFactory
     from lae_sim.latency import LatencySource
+
+
+def add_world(parser: argparse.ArgumentParser) -> None:
+    """Add what decides a replay: the frame rate, the policy and the processing times."""
+    world = parser.add_argument_group("the world and the tracker")
+    add = world.add_argument
+    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
+    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
+    add(
+        "--latency", default="recorded", help="where processing times come from (default: recorded)"
+    )
+    add(
+        "--latency-scale",
+        type=argument(parse_rational),
+        default=Fraction(1),
+        metavar="FACTOR",
+        help="multiply all times by an exact factor, such as 2 or 1/3",
+    )
+    add("--timing", metavar="TRACE", help="take the times from another device's trace")
+    add(
+        "--strided",
+        nargs="+",
+        default=[],
+        metavar="TRACE",
+        help="passes on every N-th frame (lae-sim profile --stride): each box comes from the pass "
+        "that fits the frames skipped",
+    )
 
 
 def parse_policy(text: str) -> tuple[Policy, bool]:

@@ -11,10 +11,10 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from lae_sim.cli import argument, exit_status
-from lae_sim.clock import parse_fps, parse_rational
+from lae_sim.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct
-from lae_sim.options import load_forecaster, parse_latency, parse_policy
+from lae_sim.options import add_world, load_forecaster, parse_latency, parse_policy
 
 if TYPE_CHECKING:
     from lae_sim.clock import Clock
@@ -53,29 +53,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")
-    world = made.add_argument_group("the world and the tracker")
-    add = world.add_argument
-    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
-    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
-    add(
-        "--latency", default="recorded", help="where processing times come from (default: recorded)"
-    )
-    add(
-        "--latency-scale",
-        type=argument(parse_rational),
-        default=Fraction(1),
-        metavar="FACTOR",
-        help="multiply all times by an exact factor, such as 2 or 1/3",
-    )
-    add("--timing", metavar="TRACE", help="take the times from another device's trace")
-    add(
-        "--strided",
-        nargs="+",
-        default=[],
-        metavar="TRACE",
-        help="passes on every N-th frame (lae-sim profile --stride): each box comes from the pass "
-        "that fits the frames skipped",
-    )
+    add_world(made)
     scores = made.add_argument_group("forecasting and scores")
     add = scores.add_argument
     add(
