@@ -10,20 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lae_sim.boxes import Floats
 from lae_sim.clock import Clock
-from lae_sim.engine import Ints, Policy, Schedule, Service, simulate
+from lae_sim.engine import Ints, Policy, Service, simulate
 from lae_sim.errors import LaeError
 from lae_sim.forecast import Forecaster, ForecasterFactory
 from lae_sim.frames import Image, ImageSequence
-from lae_sim.latency import by_frame
-from lae_sim.policies import every, fifo
+from lae_sim.policies import every, latest
 from lae_sim.recording import Recording
 from lae_sim.timed import Answer, TimedTracker
 
@@ -33,33 +32,30 @@ class LiveRun:
     """One sequence as a live tracker went through it.
 
     Attributes:
-        recording: truth, boxes, the schedule's times and scores, by world frame. Where the tracker
-            found nothing, the box before stands.
-        schedule: what was processed, and when.
-        measured_ns: what this machine took for each processed frame, int64 [n]; not the schedule's
-            times if those are another device's.
+        recording: truth, boxes, times and scores, by world frame. Where the tracker found nothing,
+            the box before stands.
+        frames: processed frames, int64 [n], increasing.
+        measured_ns: what this machine took for each, int64 [n]; not the recording's times if those
+            are another device's.
         cpu_ns: CPU time of all calls together, ns.
         lost: processed frames where the tracker found nothing, int64 [k].
         image_size: width and height, pixels.
     """
 
     recording: Recording
-    schedule: Schedule
+    frames: Ints
     measured_ns: Ints
     cpu_ns: int
     lost: Ints
     image_size: tuple[int, int]
 
 
-def run_live(
+def run_real_time(
     sequence: ImageSequence,
     tracker: TimedTracker,
     clock: Clock,
-    policy: Policy = fifo,
-    pre_forecaster: ForecasterFactory | None = None,
-    service: Service | None = None,
-    include_decode: bool = False,
-    progress: Callable[[int], object] = lambda frames: None,
+    policy: Policy = latest,
+    **options: Any,
 ) -> LiveRun:
     """Run a tracker through one sequence, skipping the frames that its busy times make it skip.
 
@@ -67,85 +63,96 @@ def run_live(
         sequence: frames, and the truth, whose first box initialises the tracker.
         tracker: a tracker with a stopwatch.
         clock: the world's clock.
-        policy: which frame is next; by default every frame, in order.
-        pre_forecaster: sets the search region before each frame; needs a tracker that
-            ``sets_search``.
-        service: times of another device, by frame, instead of the measured ones.
-        include_decode: count the decoding of a frame as part of its processing.
-        progress: told how many more world frames are done, after each processed one.
+        policy: which frame is next.
+        options: see :class:`Live`.
 
     Raises:
         LaeError: if the first box or a frame cannot be used, or the tracker fails.
     """
-    box = sequence.truth[0]
-    if not (np.isfinite(box).all() and (box[2:] > 0).all()):
-        raise LaeError(
-            f"sequence {sequence.name!r}: its first box is {_told(box)}, and a tracker needs one "
-            "with a width and a height"
-        )
-    if pre_forecaster is not None and not tracker.sets_search:
-        raise LaeError("a pre-forecaster needs a tracker whose search can be set, or translation")
-    live = _Live(sequence, tracker, pre_forecaster, service, include_decode, progress)
+    live = Live(sequence, tracker, **options)
     schedule = simulate(len(sequence), clock, live, policy)
-    width, height = live.size
-    answers = live.answers
-    return LiveRun(
-        recording=Recording.of_run(
-            sequence.name, schedule, live.boxes(), sequence.truth, live.scores()
-        ),
-        schedule=schedule,
-        measured_ns=np.array([answer.elapsed_ns for answer in answers], np.int64),
-        cpu_ns=sum(answer.cpu_ns for answer in answers),
-        lost=schedule.frames[[answer.box is None for answer in answers]],
-        image_size=(width, height),
-    )
+    return live.result(schedule.frames)
 
 
-def run_strided(
-    sequence: ImageSequence, tracker: TimedTracker, clock: Clock, stride: int, **options: Any
+def run_every_frame(
+    sequence: ImageSequence, tracker: TimedTracker, stride: int = 1, **options: Any
 ) -> LiveRun:
-    """Run a tracker on every ``stride``-th frame, once from each of the first ``stride`` frames.
+    """Run a tracker on every frame; the world waits for it.
 
-    So every frame f has a box, for which the tracker had last seen frame max(f - stride, 0).
+    With a stride it is run on every ``stride``-th frame, once from each of the first ``stride``
+    frames. So every frame f has a box, for which the tracker had last seen frame max(f - stride,
+    0).
 
     Args:
-        sequence, tracker, clock, options: as of :func:`run_live`.
+        sequence, tracker, options: as of :func:`run_real_time`.
         stride: frames from one processed frame to the next.
 
-    Returns:
-        The runs as one; ``schedule`` and ``measured_ns`` are by frame.
+    Raises:
+        LaeError: as :func:`run_real_time`.
     """
-    firsts = range(1, max(min(stride, len(sequence) - 1), 1) + 1)
-    runs = [run_live(sequence, tracker, clock, every(stride, first), **options) for first in firsts]
-    whole = runs[-1]  # the others are written over it; frame 0 becomes that of the first run
-    recording, measured = whole.recording, np.zeros(len(sequence), np.int64)
-    for run in reversed(runs):
-        frames, other = run.schedule.frames, run.recording
-        measured[frames] = run.measured_ns
-        recording.boxes[frames] = other.boxes[frames]
-        recording.elapsed_ns[frames] = other.elapsed_ns[frames]
-        recording.score[frames] = other.score[frames]
+    any_rate = Clock.at(Fraction(1))
+    runs = []
+    for first in range(1, max(min(stride, len(sequence) - 1), 1) + 1):
+        live = Live(sequence, tracker, **options)
+
+        def instantly(frame: int, process: Service = live) -> int:
+            process(frame)
+            return 0
+
+        schedule = simulate(len(sequence), any_rate, instantly, every(stride, first))
+        runs.append(live.result(schedule.frames))
+    whole, *others = runs
+    measured = np.zeros(len(sequence), np.int64)
+    for run in reversed(runs):  # so that frame 0 is the first run's
+        measured[run.frames] = run.measured_ns
+    for run in others:
+        frames = run.frames[1:]
+        whole.recording.boxes[frames] = run.recording.boxes[frames]
+        whole.recording.elapsed_ns[frames] = run.recording.elapsed_ns[frames]
+        whole.recording.score[frames] = run.recording.score[frames]
     return replace(
         whole,
-        schedule=simulate(len(sequence), clock, by_frame(recording), fifo),
+        frames=np.arange(len(sequence)),
         measured_ns=measured,
         cpu_ns=sum(run.cpu_ns for run in runs),
         lost=np.unique(np.concatenate([run.lost for run in runs])),
     )
 
 
-class _Live:
-    """The service that runs the tracker; it keeps the answers."""
+class Live:
+    """The service that runs a tracker through one sequence, and keeps its answers."""
 
     def __init__(
         self,
         sequence: ImageSequence,
         tracker: TimedTracker,
-        pre_forecaster: ForecasterFactory | None,
-        service: Service | None,
-        include_decode: bool,
-        progress: Callable[[int], object],
+        pre_forecaster: ForecasterFactory | None = None,
+        service: Service | None = None,
+        include_decode: bool = False,
+        progress: Callable[[int], object] = lambda frames: None,
     ) -> None:
+        """Check that the tracker can start.
+
+        Args:
+            sequence: frames and truth.
+            tracker: a tracker with a stopwatch.
+            pre_forecaster: sets the search region before each frame; needs a tracker that
+                ``sets_search``.
+            service: times of another device, by frame, instead of the measured ones.
+            include_decode: count the decoding of a frame as part of its processing.
+            progress: told how many more world frames are done, after each processed one.
+
+        Raises:
+            LaeError: if the sequence has no first box, or the tracker's search cannot be set.
+        """
+        box = sequence.truth[0]
+        if not (np.isfinite(box).all() and (box[2:] > 0).all()):
+            raise LaeError(
+                f"sequence {sequence.name!r}: its first box is {_told(box)}, and a tracker needs "
+                "one with a width and a height"
+            )
+        if pre_forecaster is not None and not tracker.sets_search:
+            raise LaeError("a pre-forecaster needs a tracker whose search can be set: translate it")
         self._sequence = sequence
         self._tracker = tracker
         self._pre_forecaster = pre_forecaster
@@ -154,8 +161,9 @@ class _Live:
         self._include_decode = include_decode
         self._progress = progress
         self._last = -1
-        self.size = (0, 0)
-        self.answers: list[Answer] = []
+        self._size = (0, 0)
+        self._answers: list[Answer] = []
+        self._elapsed_ns: list[int] = []
 
     def __call__(self, frame: int) -> int:
         """Process a frame; the time it took, ns."""
@@ -164,21 +172,23 @@ class _Live:
         decoding = perf_counter_ns() - before if self._include_decode else 0
         self._check(frame, image)
         answer = self._init(image) if frame == 0 else self._track(frame, image)
-        self.answers.append(answer)
+        self._answers.append(answer)
         self._progress(frame - self._last)
         self._last = frame
-        return self._service(frame) if self._service else answer.elapsed_ns + decoding
+        elapsed_ns = self._service(frame) if self._service else answer.elapsed_ns + decoding
+        self._elapsed_ns.append(elapsed_ns)
+        return elapsed_ns
 
     def _init(self, image: Image) -> Answer:
         box = self._sequence.truth[0].tolist()
         if self._pre_forecaster is not None:
-            self._forecaster = self._pre_forecaster(box, self.size)
+            self._forecaster = self._pre_forecaster(box, self._size)
         return self._tracker.init(image, box)
 
     def _track(self, frame: int, image: Image) -> Answer:
         if self._forecaster is None:
             return self._tracker.track(image)
-        answer = self._tracker.track(image, search_of(self._forecaster.predict(frame), self.size))
+        answer = self._tracker.track(image, search_of(self._forecaster.predict(frame), self._size))
         if answer.box is not None:
             self._forecaster.update(frame, answer.box)
         return answer
@@ -191,30 +201,38 @@ class _Live:
             )
         size = image.shape[1], image.shape[0]
         if frame == 0:
-            self.size = size
+            self._size = size
             x, y, w, h = self._sequence.truth[0]
             if x >= size[0] or y >= size[1] or x + w <= 0 or y + h <= 0:
                 raise LaeError(
                     f"{where}: the first box {_told(self._sequence.truth[0])} lies outside the "
                     f"{size[0]}x{size[1]} image"
                 )
-        elif size != self.size:
+        elif size != self._size:
             raise LaeError(
                 f"{where}: the image is {size[0]}x{size[1]}, and the first one "
-                f"{self.size[0]}x{self.size[1]}"
+                f"{self._size[0]}x{self._size[1]}"
             )
 
-    def boxes(self) -> Floats:
-        """The box of each processed frame, float64 [n, 4]; the last one found where none was."""
+    def result(self, frames: Ints) -> LiveRun:
+        """What was done, given the frames that were processed."""
+        length = len(self._sequence)
+        boxes, elapsed = np.full((length, 4), np.nan), np.full(length, -1, np.int64)
+        scores = np.full(length, np.nan, np.float32)
         found: list[Sequence[float]] = []
-        for answer in self.answers:
+        for answer in self._answers:
             found.append(found[-1] if answer.box is None else answer.box)
-        return np.array(found, np.float64)
-
-    def scores(self) -> npt.NDArray[np.float32]:
-        """The score of each processed frame, float32 [n]; NaN = none."""
-        scores = [np.nan if answer.score is None else answer.score for answer in self.answers]
-        return np.array(scores, np.float32)
+        boxes[frames] = found
+        elapsed[frames] = self._elapsed_ns
+        scores[frames] = [np.nan if a.score is None else a.score for a in self._answers]
+        return LiveRun(
+            Recording.new(self._sequence.name, self._sequence.truth, boxes, elapsed, scores),
+            frames,
+            np.array([answer.elapsed_ns for answer in self._answers], np.int64),
+            sum(answer.cpu_ns for answer in self._answers),
+            frames[[answer.box is None for answer in self._answers]],
+            self._size,
+        )
 
 
 def search_of(box: Sequence[float], size: tuple[int, int]) -> list[float]:

@@ -113,6 +113,11 @@ class Metadata:
         return int(self.document["schedule"].get("stride", 1))
 
     @property
+    def profiled(self) -> bool:
+        """Whether the trace names the clock of its times, as those of the profiler do."""
+        return "clock" in self.document.get("timing", {})
+
+    @property
     def timing_note(self) -> str | None:
         """What the trace says of times that were not measured, if it does."""
         note = self.document.get("timing", {}).get("source")

@@ -92,7 +92,12 @@ def parser() -> argparse.ArgumentParser:
     group = made.add_argument_group("the frames")
     add = group.add_argument
     add("--dataset", metavar="NAME", help="such as DTB70; found out from --root if it can be")
-    add("--root", type=Path, metavar="PATH", help="folder of the dataset, or a video (default: synthetic)")
+    add(
+        "--root",
+        type=Path,
+        metavar="PATH",
+        help="folder of the dataset, or a video (default: synthetic)",
+    )
     add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
     add("--box", type=argument(_box), metavar="X,Y,W,H", help="first box, for a video")
     add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the dataset's)")
@@ -251,9 +256,8 @@ def _passes(
     """The first pass and its repetitions, the strided ones and the closed loops."""
     from lae_sim.clock import Clock
     from lae_sim.files import check_distinct
-    from lae_sim.live import run_live, run_strided
+    from lae_sim.live import run_every_frame, run_real_time
     from lae_sim.passes import Pass, base_document, parse_timing, scheduled
-    from lae_sim.policies import fifo
     from lae_sim.translation import Translated
 
     clock = Clock.at(dataset.fps)
@@ -271,7 +275,6 @@ def _passes(
     )
     common: dict[str, Any] = {
         "tracker": tracker,
-        "clock": clock,
         "include_decode": arguments.include_decode,
     }
     if arguments.pre_forecaster is not None:
@@ -288,7 +291,9 @@ def _passes(
 
         def run(sequence: ImageSequence, progress: Progress) -> LiveRun:
             service = times(sequence.name) if times else None
-            return run_live(sequence, policy=policy, service=service, progress=progress, **common)
+            return run_real_time(
+                sequence, clock=clock, policy=policy, service=service, progress=progress, **common
+            )
 
         named = arguments.policy or "latest"
         return task(name, run, kind="real-time", policy=named, source=source)
@@ -296,14 +301,14 @@ def _passes(
     def whole(name: str) -> Pass:
         if mode == "real-time":
             return real_time(name, arguments.timing)
-        return task(name, partial(run_live, policy=fifo, **common), kind="every-frame")
+        return task(name, partial(run_every_frame, **common), kind="every-frame")
 
     passes = [whole("")]
     passes += [whole(f"repeat{n}") for n in range(2, arguments.repeat + 1)]
     passes += [
         task(
             f"stride{stride}",
-            partial(run_strided, stride=stride, **common),
+            partial(run_every_frame, stride=stride, **common),
             rounds=stride,
             kind="every-frame",
             stride=stride,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterable, Iterator, Sized
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -60,7 +60,7 @@ def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None =
     """
     stored = _StoredRecordings(Path(path), None if sequences is None else frozenset(sequences))
     metadata, rows = stored.describe()
-    return Trace(metadata, stored, rows)
+    return Trace(metadata, replace(stored, profiled=metadata.profiled), rows)
 
 
 def validate(path: str | os.PathLike[str]) -> None:
@@ -88,7 +88,7 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
         [pa.field(name, types[name], nullable=name not in ("sequence", "frame")) for name in types],
         {"lae_sim": trace.metadata.dumps()},
     )
-    check = RowChecker(str(path))
+    check = RowChecker(str(path), profiled=trace.metadata.profiled)
     with (
         written_whole(path) as temporary,
         pq.ParquetWriter(
@@ -137,6 +137,7 @@ class _StoredRecordings:
 
     path: Path
     keep: frozenset[str] | None
+    profiled: bool = False
 
     def describe(self) -> tuple[Metadata, int]:
         """The file's metadata and its number of rows."""
@@ -164,7 +165,7 @@ class _StoredRecordings:
 
     def _all(self) -> Iterator[Recording]:
         """Recordings, put together again where a batch ends inside one."""
-        check = RowChecker(str(self.path))
+        check = RowChecker(str(self.path), profiled=self.profiled)
         parts: list[Recording] = []
         for rows in self._rows():
             check(rows)

@@ -1,0 +1,272 @@
+"""The live service: what a tracker is given, and that a replay repeats what it did."""
+
+from __future__ import annotations
+
+import tempfile
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fakes import FakeTimed, bright_frame, bright_sequence
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lae_sim.clock import Clock
+from lae_sim.engine import Policy
+from lae_sim.errors import LaeError
+from lae_sim.forecast import ConstantVelocity
+from lae_sim.frames import ImageSequence
+from lae_sim.kalman import Kalman
+from lae_sim.live import LiveRun, run_every_frame, run_real_time, search_of
+from lae_sim.metadata import Metadata
+from lae_sim.policies import every, fifo, latest, shrinking_tail, vot_realtime
+from lae_sim.recording import Recording
+from lae_sim.run import Run, replay_trace
+from lae_sim.timed import Answer, TrackerFailure
+from lae_sim.trace import Trace, read_trace, write_trace
+
+CLOCK = Clock.at(Fraction(30))
+FRAME_NS = 33_333_334  # a little more than an interval at 30 fps
+PATH = [(5.0 + 2 * i, 8.0 + i) for i in range(30)]
+
+
+def stored(run: LiveRun, policy: Policy, kind: str, fps: Fraction = Fraction(30)) -> Run:
+    """The run written to a trace, read again and replayed."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "trace.parquet"
+        metadata = Metadata.new(str(fps), kind, timing={"clock": "made up"})
+        write_trace(Trace(metadata, [run.recording]), path)
+        (found,) = replay_trace(read_trace(path), policy=policy)
+    return found
+
+
+def assert_equal(found: Run, run: LiveRun) -> None:
+    """The same to the bit."""
+    assert found.departures == 0
+    np.testing.assert_array_equal(found.schedule.frames, run.frames)
+    np.testing.assert_array_equal(found.schedule.elapsed_ns, run.recording.elapsed_ns[run.frames])
+    for column in ("truth", "boxes", "elapsed_ns", "score"):
+        np.testing.assert_array_equal(
+            getattr(found.recording, column), getattr(run.recording, column)
+        )
+    np.testing.assert_array_equal(found.boxes, run.recording.boxes[run.frames])
+
+
+POLICIES = st.one_of(
+    st.sampled_from([latest, fifo, vot_realtime(), vot_realtime(0)]),
+    st.integers(1, 5).map(every),
+    st.integers(0, 4 * FRAME_NS).map(shrinking_tail),
+)
+
+
+@given(
+    times=st.lists(st.integers(1, 5 * FRAME_NS), min_size=1, max_size=9),
+    policy=POLICIES,
+    fps=st.sampled_from([Fraction(30), Fraction(30000, 1001), Fraction(7)]),
+    pre_forecaster=st.sampled_from([None, Kalman, ConstantVelocity]),
+)
+def test_a_replay_equals_the_profile_to_the_bit(
+    times: list[int], policy: Policy, fps: Fraction, pre_forecaster: type | None
+) -> None:
+    run = run_real_time(
+        bright_sequence(PATH),
+        FakeTimed(times),
+        Clock.at(fps),
+        policy,
+        pre_forecaster=pre_forecaster,
+    )
+    kind = "every-frame" if len(run.frames) == len(PATH) else "real-time"
+    assert_equal(stored(run, policy, kind, fps), run)
+
+
+@given(
+    times=st.lists(st.integers(0, 3 * FRAME_NS), min_size=1, max_size=9), stride=st.integers(1, 6)
+)
+def test_a_strided_pass_sees_each_frame_after_the_one_a_stride_before(
+    times: list[int], stride: int
+) -> None:
+    sequence = bright_sequence(PATH)
+    strided = run_every_frame(sequence, FakeTimed(times), stride)
+    assert not np.isnan(strided.recording.boxes).any()
+    assert (strided.recording.elapsed_ns >= 0).all()
+    for first in range(1, stride + 1):
+        slow_world = Clock.at(Fraction(1, 9))
+        alone = run_real_time(sequence, FakeTimed(times), slow_world, every(stride, first))
+        frames = alone.frames
+        assert frames.tolist() == [0, *range(first, len(PATH), stride)]
+        np.testing.assert_array_equal(
+            strided.recording.boxes[frames], alone.recording.boxes[frames]
+        )
+        np.testing.assert_array_equal(strided.measured_ns[frames[1:]], alone.measured_ns[1:])
+
+
+def test_a_stride_longer_than_the_sequence() -> None:
+    run = run_every_frame(bright_sequence(PATH[:3]), FakeTimed(), 9)
+    assert not np.isnan(run.recording.boxes).any()
+    one = run_every_frame(bright_sequence(PATH[:1]), FakeTimed(), 2)
+    assert one.frames.tolist() == [0]
+
+
+def test_a_busy_tracker_skips_frames_by_its_own_times() -> None:
+    run = run_real_time(bright_sequence(PATH), FakeTimed([100_000_000]), CLOCK, latest)
+    assert run.frames.tolist() == list(range(0, 30, 3))
+    assert run.measured_ns.tolist() == [100_000_000] * 10
+    assert run.image_size == (96, 64)
+
+
+def test_another_devices_times_drive_the_schedule_and_fill_the_trace() -> None:
+    run = run_real_time(
+        bright_sequence(PATH), FakeTimed([7]), CLOCK, latest, service=lambda frame: 100_000_000
+    )
+    assert run.frames.tolist() == list(range(0, 30, 3))
+    assert set(run.recording.elapsed_ns[run.frames].tolist()) == {100_000_000}
+    assert set(run.measured_ns.tolist()) == {7}
+
+
+def test_the_pre_forecaster_sets_the_search_before_each_frame() -> None:
+    """Alg. 1: predict at the frame to be processed, from the boxes of those before it."""
+    tracker = FakeTimed([100_000_000], reach=1.0)
+    run = run_real_time(bright_sequence(PATH), tracker, CLOCK, latest, pre_forecaster=Kalman)
+    filtered = Kalman(PATH[0] + (12, 10))
+    for frame, search in zip(run.frames[1:].tolist(), tracker.searches):
+        predicted = filtered.predict(frame)
+        assert search == pytest.approx(search_of(predicted, (96, 64)), abs=1e-12)
+        if frame not in run.lost:
+            filtered.update(frame, run.recording.boxes[frame].tolist())
+
+
+def test_the_closed_loop_finds_what_the_plain_loop_loses() -> None:
+    path = [(2.0 + 3 * i, 8.0) for i in range(27)]
+    sequence, reach = bright_sequence(path), 7.0  # the target moves 9 pixels in 3 frames
+    frames = slice(0, None, 3)
+    slow = [20_000_000] * 4 + [100_000_000] * 40  # fast at first, so that the motion is learnt
+    plain = run_real_time(sequence, FakeTimed(slow, reach), CLOCK, latest)
+    closed = run_real_time(
+        sequence, FakeTimed(slow, reach), CLOCK, latest, pre_forecaster=ConstantVelocity
+    )
+    assert len(plain.lost) > 3
+    assert len(closed.lost) == 0
+    last = closed.frames[-1]
+    assert closed.recording.boxes[last].tolist() == sequence.truth[last].tolist()
+    assert plain.recording.boxes[frames].shape == closed.recording.boxes[frames].shape
+
+
+def test_where_nothing_is_found_the_box_before_stands() -> None:
+    path = [*PATH[:4], (-50.0, -50.0), (-50.0, -50.0), *PATH[6:9]]
+    run = run_real_time(bright_sequence(path), FakeTimed(), CLOCK)
+    assert run.lost.tolist() == [4, 5]
+    np.testing.assert_array_equal(run.recording.boxes[5], run.recording.boxes[3])
+    assert np.isnan(run.recording.score[[0, 4, 5]]).all()
+    assert run.recording.score[3] == np.float32(0.75)
+
+
+def test_progress_adds_up() -> None:
+    told: list[int] = []
+    run_real_time(
+        bright_sequence(PATH), FakeTimed([100_000_000]), CLOCK, latest, progress=told.append
+    )
+    assert told == [1] + [3] * 9
+
+
+def test_decoding_counts_if_asked_for() -> None:
+    sequence = bright_sequence(PATH)
+    run = run_real_time(sequence, FakeTimed([5]), CLOCK, include_decode=True)
+    assert (run.recording.elapsed_ns > 5).all()
+    assert set(run.measured_ns.tolist()) == {5}
+
+
+@pytest.mark.parametrize(
+    ("box", "message"),
+    [
+        ([np.nan] * 4, "first box"),
+        ([5, 5, 0, 0], "width and a height"),
+        ([5, 5, 3, 0], "width and a height"),
+        ([96, 5, 3, 3], "outside the 96x64 image"),
+        ([-9, 5, 9, 3], "outside the 96x64 image"),
+    ],
+)
+def test_a_first_box_that_cannot_be_used(box: list[float], message: str) -> None:
+    truth = np.array([box] * 3, np.float64)
+    sequence = ImageSequence("odd", truth, lambda frame: bright_frame(5, 5))
+    with pytest.raises(LaeError, match=message):
+        run_real_time(sequence, FakeTimed(), CLOCK)
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (np.zeros((64, 96), np.uint8), "uint8"),
+        (np.zeros((64, 96, 3), np.uint16), "uint16"),
+        (np.zeros((64, 96, 4), np.uint8), r"\(64, 96, 4\)"),
+        (np.zeros((32, 96, 3), np.uint8), "is 96x32, and the first one 96x64"),
+    ],
+)
+def test_a_frame_that_cannot_be_used(frame: np.ndarray, message: str) -> None:
+    sequence = ImageSequence(
+        "odd",
+        np.array([[5, 5, 9, 9]] * 5, np.float64),
+        lambda i: frame if i == 3 else bright_frame(5, 5),
+    )
+    with pytest.raises(LaeError, match=f"'odd', frame 3.*{message}"):
+        run_real_time(sequence, FakeTimed(), CLOCK)
+
+
+def test_a_failing_tracker_is_not_hidden() -> None:
+    class Failing(FakeTimed):
+        def track(self, frame: np.ndarray, search: object = None) -> Answer:
+            raise TrackerFailure("no")
+
+    with pytest.raises(TrackerFailure, match="no"):
+        run_real_time(bright_sequence(PATH), Failing(), CLOCK)
+
+
+def test_a_pre_forecaster_needs_search_control() -> None:
+    with pytest.raises(LaeError, match="translate"):
+        run_real_time(
+            bright_sequence(PATH),
+            FakeTimed(sets_search=False),
+            CLOCK,
+            latest,
+            pre_forecaster=Kalman,
+        )
+
+
+def test_a_search_stays_within_the_image() -> None:
+    assert search_of([10, 20, 4, 6], (96, 64)) == [12, 23, 4, 6]
+    assert search_of([-50, 100, -3, 5000], (96, 64)) == [0, 64, 1, 64]
+    with pytest.raises(LaeError, match="pre-forecaster"):
+        search_of([np.nan, 0, 1, 1], (96, 64))
+
+
+@given(stride=st.sampled_from([2, 3]), at=st.integers(1, 3))
+def test_strided_passes_make_a_replay_at_their_stride_exact(stride: int, at: int) -> None:
+    """A tracker that always takes the stride, and starts in any of its phases, is repeated."""
+    sequence = bright_sequence(PATH)
+    times = [min(at, stride) * FRAME_NS] + [stride * FRAME_NS] * 40
+    closed = run_real_time(sequence, FakeTimed(times), CLOCK, latest)
+    kind = Metadata.new("30", "every-frame")
+    whole = Trace(kind, [run_every_frame(sequence, FakeTimed()).recording])
+    strided = [
+        Trace(
+            Metadata.new("30", "every-frame", schedule={"stride": k}),
+            [run_every_frame(sequence, FakeTimed(), k).recording],
+        )
+        for k in (2, 3)
+    ]
+    timing = Trace(Metadata.new("30", "real-time"), [closed.recording])
+    (bare,) = replay_trace(whole, timing=timing)
+    (found,) = replay_trace(whole, timing=timing, strided=strided)
+    np.testing.assert_array_equal(found.schedule.frames, closed.frames)
+    np.testing.assert_array_equal(found.boxes, closed.recording.boxes[closed.frames])
+    assert found.departures == 0 < bare.departures
+    (itself,) = replay_trace(strided[stride - 2], timing=timing)
+    np.testing.assert_array_equal(itself.boxes, found.boxes)
+    assert itself.departures == 0
+
+
+def test_each_stride_once() -> None:
+    recording = Recording.new("a", [[1, 1, 1, 1]], [[1, 1, 1, 1]], [1])
+    trace = Trace(Metadata.new("30", "every-frame"), [recording])
+    with pytest.raises(LaeError, match="stride"):
+        list(replay_trace(trace, strided=[trace]))
