@@ -13,7 +13,7 @@ from lae_sim.errors import LaeError
 
 @contextmanager
 def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path beside ``path``; on success it is synced and takes its place.
+    """Give a temporary path beside ``path``, of the same suffix; on success it takes its place.
 
     If the block fails, or the process is killed, ``path`` is as it was.
 
@@ -25,7 +25,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         if target.exists() and not target.is_file():
             raise LaeError(f"cannot write {path}: it is there already and is not a file")
         handle, name = tempfile.mkstemp(
-            prefix=f".{target.name}.", suffix=".part", dir=target.parent
+            prefix=f".{target.stem}.", suffix=f".part{target.suffix}", dir=target.parent
         )
     except OSError as error:
         raise LaeError(f"cannot write {target}: {error.strerror or error}") from error
