@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Mapping
@@ -18,7 +19,7 @@ _HEADS = ("name", "model", "version", "kind", "source", "policy")
 
 
 def overview(report: Report) -> str:
-    """A trace's report (see ``lae_sim.show.describe``) in lines of about 96 columns."""
+    """A trace's report (see ``lae_sim.show.describe``) in lines of 96 columns, or the terminal's."""
     provenance = dict(report["provenance"])
     times = report["times"]
     lines = [_words(report["trace"]), ""]
@@ -38,7 +39,8 @@ def overview(report: Report) -> str:
 
 def _entry(label: str, text: str) -> str:
     label = _words(label)[: _INDENT - 1].ljust(_INDENT)
-    return textwrap.fill(text, _WIDTH, initial_indent=label, subsequent_indent=" " * _INDENT)
+    width = max(60, min(_WIDTH, shutil.get_terminal_size((_WIDTH, 24)).columns))
+    return textwrap.fill(text, width, initial_indent=label, subsequent_indent=" " * _INDENT)
 
 
 def _section(label: str, section: Any) -> list[str]:
@@ -181,20 +183,20 @@ def _drift(times: Mapping[str, Any]) -> list[str]:
     drift = times["drift"]
     if not drift:
         return []
-    order = "" if times["order_known"] else ", sequences by name (their order is not recorded)"
+    order = "" if times["order_known"] else " (sequences by name: their order is unknown)"
     ratios = f"last third to first: {drift['ratio']:.2f} over the run"
     if drift["ratio"] > 1.1 and not drift["slower"]:
         ratios += " (within chance)"
     if drift["within"] is not None:
         ratios += f", {drift['within']:.2f} within sequences"
     tenths = "  ".join(map(_figure, drift["tenths_ms"]))
-    return [f"medians of the tenths of the run, ms{order}", f"  {tenths}", ratios, ""]
+    return [f"medians of tenths of the run, ms{order}", f"  {tenths}", ratios, ""]
 
 
 def _stalls(stalls: list[dict[str, Any]], most: int = 10) -> list[str]:
     if not stalls:
         return []
-    lines = [f"stalls: {len(stalls):,} calls took over 10 x the median of the run and the sequence"]
+    lines = [f"stalls: {len(stalls):,} calls took over 10 x the median of run and sequence"]
     listed = sorted(stalls, key=lambda stall: bool(stall["first_call"]))
     for stall in listed[:most]:
         note = ": first call after initialisation" if stall["first_call"] else ""

@@ -174,6 +174,8 @@ def test_an_agx_xavier_with_jetpack_5(tmp_path: Path) -> None:
             "etc/nvpmodel.conf": "< POWER_MODEL ID=0 NAME=MAXN >\n"
             "< POWER_MODEL ID=3 NAME=30W_ALL >\n",
             "var/lib/nvpmodel/status": "pmode:0003 fmode:fanNull\n",
+            "var/lib/dpkg/status": "Package: nvidia-jetpack\nStatus: deinstall ok config-files\n\n"
+            "Package: zlib1g\nVersion: 1.2\n",
             "sys/class/devfreq/17000000.gv11b/cur_freq": "318750000\n",
             "sys/class/devfreq/17000000.gv11b/max_freq": "905250000\n",
             **zone(0, "CPU-therm", "33500"),
