@@ -19,7 +19,7 @@ _HEADS = ("name", "model", "version", "kind", "source", "policy")
 
 
 def overview(report: Report) -> str:
-    """A trace's report (see ``lae_sim.show.describe``) in lines of 96 columns, or the terminal's."""
+    """A trace's report (see ``lae_sim.show.describe``) in lines that fit the terminal."""
     provenance = dict(report["provenance"])
     times = report["times"]
     lines = [_words(report["trace"]), ""]
