@@ -1,0 +1,319 @@
+"""A discriminative correlation filter: the tracker that needs no weights.
+
+The position comes from a filter on gradient and colour channels [1] that is confined to the target
+[2, 3] and kept close to the filter before [4]; the size from a filter over scales [5]. The score is
+the peak-to-sidelobe ratio [6], and a frame with a low one is not learnt from.
+
+[1] Henriques et al., High-Speed Tracking with Kernelized Correlation Filters, TPAMI 2015.
+[2] Kiani Galoogahi et al., Learning Background-Aware Correlation Filters, ICCV 2017.
+[3] Lukezic et al., Discriminative Correlation Filter with Channel and Spatial Reliability, CVPR 2017.
+[4] Li et al., Learning Spatial-Temporal Regularized Correlation Filters, CVPR 2018.
+[5] Danelljan et al., Discriminative Scale Space Tracking, TPAMI 2017.
+[6] Bolme et al., Visual Object Tracking using Adaptive Correlation Filters, CVPR 2010.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Sequence, Tuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim.errors import LaeError
+from lae_sim.trackers.inputs import checked_box, checked_frame
+from lae_sim.trackers.protocol import Image
+
+Array = npt.NDArray[Any]
+
+CELL = 4  # pixels
+CELLS = 32  # of the search window, whose side is CELL * CELLS pixels whatever the target's size
+ORDERS = 3  # of the Fourier series of a gradient histogram
+BINS = 2 * ORDERS + 1
+SCALE_SIDE = 32  # pixels of a patch of the scale filter
+SMALLEST = 32.0  # side of the search window, pixels of the frame
+
+# With the mean energy of the channels as unit: the penalty that ties the filter to the one before,
+# the step size of ADMM and its growth, the ridge.
+TEMPORAL, STEP, GROWTH, RIDGE = 20.0, 0.01, 4.0, 0.01
+ITERATIONS = 2
+
+
+class Dcf:
+    """A discriminative correlation filter on the CPU, or with its transforms on a GPU.
+
+    Args:
+        device: ``"cpu"`` (NumPy), or a device of torch: ``"cuda:0"``, ``"torch:cpu"``.
+        padding: side of the search window over the target's ``sqrt(w * h)``.
+        scales: number of scales that are compared; 1 keeps the size.
+        scale_step: ratio of one scale to the next.
+        min_psr: peak-to-sidelobe ratio below which a frame is not learnt from.
+
+    Raises:
+        LaeError: if the device cannot be used, or a setting is out of range.
+    """
+
+    def __init__(
+        self,
+        device: str = "cpu",
+        padding: float = 4.0,
+        scales: int = 17,
+        scale_step: float = 1.03,
+        min_psr: float = 7.0,
+    ) -> None:
+        if not (padding > 1 and scales >= 1 and scales % 2 and 1 < scale_step < 2):
+            raise LaeError("dcf: padding must exceed 1, scales be odd, scale_step within 1..2")
+        self._settings = {
+            "device": device,
+            "padding": padding,
+            "scales": scales,
+            "scale_step": scale_step,
+            "min_psr": min_psr,
+        }
+        self._padding, self._min_psr = padding, min_psr
+        self._torch, self._device = _torch(device)
+        self._fft: Any = self._torch.fft if self._torch else np.fft
+        window = np.hanning(CELLS + 2)[1:-1]
+        self._window = np.outer(window, window).astype(np.float32)
+        # a Gaussian of a sixteenth of the target's size [2], in cells
+        wanted = _gaussian(CELLS, CELLS / padding / 16)
+        self._wanted = self._to(np.fft.rfft2(np.outer(wanted, wanted)).real.astype(np.float32))
+        self._steps = scale_step ** (np.arange(scales) - scales // 2.0)
+        self._scale_window = np.hanning(scales + 2)[1:-1, None].astype(np.float32)
+        wanted_scale = np.fft.rfft(_gaussian(scales, scales / 16))
+        self._wanted_scale = wanted_scale.astype(np.complex64)[:, None]
+        self._started = False
+
+    def init(self, frame: Image, box: Sequence[float]) -> None:
+        """Learn the target in its first frame.
+
+        Raises:
+            LaeError: if the frame is no image, or the box no box.
+        """
+        frame = checked_frame(frame)
+        x, y, w, h = checked_box(box)
+        self._size = np.array([w, h])
+        self._centre = np.array([x + w / 2, y + h / 2])  # of pixel edges: 0 is the image's corner
+        self._keep_inside(frame)
+        half_cells = self._size / self._side() * CELLS / 2
+        columns, rows = (abs(np.arange(CELLS) - CELLS // 2) <= half + 0.5 for half in half_cells)
+        self._mask = self._to(np.outer(rows, columns).astype(np.float32))
+        self._started = False
+        self._learn(frame)
+        self._started = True
+
+    def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
+        """Search the next frame around this centre for a target of this size.
+
+        Raises:
+            LaeError: if a number is not finite.
+        """
+        if not np.isfinite([cx, cy, w, h]).all():
+            raise LaeError(f"cannot search around {cx, cy} for a target of {w, h} pixels")
+        self._centre = np.array([cx, cy], float)
+        self._size = np.maximum([w, h], 1.0)
+
+    def track(self, frame: Image) -> Tuple[Tuple[float, float, float, float], float]:
+        """The target's box in the next frame, and the peak-to-sidelobe ratio.
+
+        Raises:
+            LaeError: if the frame is no image, or ``init`` was not called.
+        """
+        frame = checked_frame(frame)
+        if not self._started:
+            raise LaeError("dcf: init must come before track")
+        self._keep_inside(frame)
+        response = self._response(self._channels(frame))
+        peak, psr = _peak(response)
+        self._centre += (peak - CELLS // 2) * self._side() / CELLS
+        self._keep_inside(frame)
+        if psr >= self._min_psr:
+            self._rescale(frame)
+            self._learn(frame)
+        (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
+        return (cx - w / 2, cy - h / 2, w, h), psr
+
+    def sync(self) -> None:
+        """Wait for the GPU, if one is used."""
+        if self._torch and self._device.type == "cuda":
+            self._torch.cuda.synchronize(self._device)
+
+    def describe(self) -> "dict[str, Any]":
+        """Name, version and settings."""
+        return {"name": "dcf", "version": "1", "settings": self._settings}
+
+    def _to(self, array: Array) -> Any:
+        return self._torch.from_numpy(array).to(self._device) if self._torch else array
+
+    def _side(self) -> float:
+        return max(self._padding * float(np.sqrt(self._size.prod())), SMALLEST)
+
+    def _keep_inside(self, frame: Image) -> None:
+        edge = np.array(frame.shape[1::-1], float)
+        self._centre = np.clip(self._centre, 0.0, edge)
+        self._size = np.minimum(self._size, np.maximum(4.0 * edge.max(), 1.0))
+
+    def _channels(self, frame: Image) -> Any:
+        """Fourier transform of the search window's channels, complex64 [C, CELLS, CELLS/2 + 1]."""
+        side = self._side()
+        found = _features(_crop(frame, self._centre, (side, side), CELLS * CELL))
+        found -= found.mean((1, 2), keepdims=True)
+        return self._fft.rfft2(self._to(found * self._window))
+
+    def _response(self, x: Any) -> Array:
+        response = self._fft.irfft2((self._filter.conj() * x).sum(0), (CELLS, CELLS))
+        return np.fft.fftshift(response.cpu().numpy() if self._torch else response)
+
+    def _learn(self, frame: Image) -> None:
+        """The filter g that minimises, over the window's frequencies, with T = TEMPORAL,
+
+            |g^H x - y|^2 + T |g - g_before|^2 + RIDGE |g|^2, g zero outside of the target
+
+        by ADMM as in [2] and [4], the solution for each frequency by Sherman-Morrison's formula.
+        """
+        x = self._channels(frame)
+        energy = (x * x.conj()).real.sum(0)
+        unit = float(energy.mean()) + 1e-6
+        temporal = TEMPORAL * unit if self._started else 0.0
+        wanted = x * self._wanted
+        if self._started:
+            wanted = wanted + temporal * self._filter
+        step, confined, dual = STEP * unit, 0.0, 0.0
+        for _ in range(ITERATIONS):
+            v = wanted + step * (confined - dual)
+            inverse = (x.conj() * v).sum(0) / (step + temporal + energy)
+            free = (v - x * inverse) / (step + temporal)
+            weight = self._mask * (step / (step + RIDGE * unit))
+            confined = self._fft.rfft2(self._fft.irfft2(free + dual, (CELLS, CELLS)) * weight)
+            dual = (dual + free - confined) / GROWTH
+            step *= GROWTH
+        self._filter = confined
+        self._learn_scale(frame)
+
+    def _scale_features(self, frame: Image) -> Array:
+        """Fourier transform over the scales of the target's features, complex64 [S/2 + 1, F]."""
+        patches = [_crop(frame, self._centre, self._size * s, SCALE_SIDE) for s in self._steps]
+        found = _features(np.concatenate(patches))  # at once: 17 calls cost 4 times as much
+        rows = found.reshape(len(found), len(patches), -1).swapaxes(0, 1).reshape(len(patches), -1)
+        return np.fft.rfft(rows * self._scale_window, axis=0).astype(np.complex64)
+
+    def _learn_scale(self, frame: Image) -> None:
+        """Numerator and denominator of [5], Eq. 5, as running averages."""
+        z = self._scale_features(frame)
+        numerator, energy = z * self._wanted_scale.conj(), (z * z.conj()).real.sum(1)
+        rate = 0.025 if self._started else 1.0
+        before = (self._numerator, self._energy) if self._started else (0.0, 0.0)
+        self._numerator = (1 - rate) * before[0] + rate * numerator
+        self._energy = (1 - rate) * before[1] + rate * energy
+
+    def _rescale(self, frame: Image) -> None:
+        """Multiply the size by the scale that responds most ([5], Eq. 6)."""
+        count = len(self._steps)
+        ridge = 0.01 * self._energy.mean() + 1e-6
+        z = (self._numerator.conj() * self._scale_features(frame)).sum(1) / (self._energy + ridge)
+        response = np.fft.fftshift(np.fft.irfft(z, count))
+        best = int(response.argmax())
+        offset = _vertex(*response[best - 1 : best + 2]) if 0 < best < count - 1 else 0.0
+        step = self._settings["scale_step"]
+        size = self._size * float(step) ** (best + offset - count // 2)
+        if size.min() >= 1 and size.max() <= 2 * max(frame.shape[:2]):
+            self._size = size
+
+
+def _torch(device: str) -> Tuple[Any, Any]:
+    """Torch and its device, or nothing where NumPy is meant."""
+    if device == "cpu":
+        return None, None
+    try:
+        import torch
+
+        found = torch.device(device[6:] if device.startswith("torch:") else device)
+        torch.zeros(1, device=found)
+    except (ImportError, RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise LaeError(f"dcf: the device {device!r} cannot be used: {reason}") from error
+    return torch, found
+
+
+def _crop(frame: Image, centre: Array, size: Sequence[float], side: int) -> Image:
+    """What the box shows, as uint8 [side, side, 3]; beyond the image its edge is repeated."""
+    # warpAffine does not average: a small picture of a large box is made from a larger one
+    finer = int(np.clip(np.ceil(max(size) / side / 1.5), 1, 4))
+    pixels = side * finer
+    sx, sy = pixels / size[0], pixels / size[1]
+    left, top = centre[0] - size[0] / 2, centre[1] - size[1] / 2
+    # the centres of the first pixels coincide
+    matrix = np.array([[sx, 0, sx * (0.5 - left) - 0.5], [0, sy, sy * (0.5 - top) - 0.5]])
+    patch = cv2.warpAffine(frame, matrix, (pixels, pixels), borderMode=cv2.BORDER_REPLICATE)
+    if finer > 1:
+        patch = cv2.resize(patch, (side, side), interpolation=cv2.INTER_AREA)
+    return np.asarray(patch, np.uint8)
+
+
+def _features(patch: Image) -> Array:
+    """Gradient histograms and mean colours of the cells, float32 [BINS + 3, H/CELL, W/CELL].
+
+    A histogram of orientations is summed as its Fourier series (Liu et al., Rotation-Invariant HOG
+    Descriptors Using Fourier Analysis in Polar and Spherical Coordinates, IJCV 2014): that takes no
+    arctangent and no binning of pixels. It is then normalised and clipped (Dalal and Triggs,
+    Histograms of Oriented Gradients for Human Detection, CVPR 2005).
+    """
+    cells = (patch.shape[1] // CELL, patch.shape[0] // CELL)
+    lab = cv2.cvtColor(patch, cv2.COLOR_BGR2LAB)
+    grey = np.ascontiguousarray(lab[..., 0])
+    gradient = np.empty(grey.shape, np.complex64)
+    gradient.real = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)
+    gradient.imag = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1)
+    magnitude = np.abs(gradient)
+    turn = gradient / (magnitude + 1e-6)
+    turn *= turn  # opposite gradients are one orientation
+    terms = [magnitude]
+    term = magnitude * turn
+    for _ in range(ORDERS):
+        terms += [term.real.copy(), term.imag.copy()]
+        term *= turn
+    series = np.stack([cv2.resize(t, cells, interpolation=cv2.INTER_AREA) for t in terms])
+    histogram = np.maximum(_SERIES_TO_BINS @ series.reshape(len(series), -1), 0.0)
+    histogram = histogram.reshape(BINS, cells[1], cells[0])
+    energy = cv2.blur((histogram**2).sum(0), (3, 3))
+    histogram = np.minimum(histogram / np.sqrt(energy + 0.5), 0.4)
+    colour = cv2.resize(lab, cells, interpolation=cv2.INTER_AREA).transpose(2, 0, 1) / 255.0 - 0.5
+    return np.concatenate([histogram, 2.0 * colour]).astype(np.float32)
+
+
+def _series_to_bins() -> Array:
+    """The values of the series at the bins' orientations, smoothed as if bins were triangles."""
+    order = np.arange(1, ORDERS + 1)[:, None]
+    angle = 2 * order * np.arange(BINS) * np.pi / BINS
+    weight = 2 * np.sinc(order / BINS) ** 2
+    waves = np.stack([weight * np.cos(angle), weight * np.sin(angle)], 1).reshape(-1, BINS)
+    return np.concatenate([np.ones((1, BINS)), waves]).T.astype(np.float32) / BINS
+
+
+_SERIES_TO_BINS = _series_to_bins()
+
+
+def _gaussian(count: int, sigma: float) -> Array:
+    """A Gaussian around index 0, wrapped around, float64 [count]."""
+    return np.fft.ifftshift(np.exp(-0.5 * ((np.arange(count) - count // 2) / sigma) ** 2))
+
+
+def _peak(response: Array) -> Tuple[Array, float]:
+    """Where the response is largest (x, y in cells, between cells too), and the ratio of [6]."""
+    r = response.astype(np.float64)
+    row, column = (int(i) for i in np.unravel_index(r.argmax(), r.shape))
+    top = r[row, column]
+    peak = np.array([column, row], float)
+    if 0 < row < CELLS - 1 and 0 < column < CELLS - 1:
+        peak[0] += _vertex(*r[row, column - 1 : column + 2])
+        peak[1] += _vertex(*r[row - 1 : row + 2, column])
+    sidelobe = np.ones(r.shape, bool)
+    sidelobe[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4] = False
+    rest = r[sidelobe]
+    return peak, float((top - rest.mean()) / (rest.std() + 1e-9))
+
+
+def _vertex(left: float, middle: float, right: float) -> float:
+    """Where the parabola through three points at -1, 0, 1 is largest, middle being the largest."""
+    bend = left - 2 * middle + right
+    return float(np.clip((left - right) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
