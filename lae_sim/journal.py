@@ -64,7 +64,7 @@ class Journal:
 
     def finished(self, name: str) -> list[str]:
         """The finished sequences of a pass, sorted."""
-        return sorted(unquote(path.stem) for path in (self._folder / name).glob("*.parquet"))
+        return sorted(unquote(path.stem) for path in (self._folder / name).glob("[!.]*.parquet"))
 
     def add(self, name: str, recording: Recording, metadata: Metadata) -> None:
         """Keep a finished sequence of a pass."""
@@ -90,7 +90,7 @@ class Journal:
 
 
 def _file_name(sequence: str) -> str:
-    return quote(sequence, safe=" ") + ".parquet"
+    return quote(sequence, safe=" ").replace(".", "%2E") + ".parquet"
 
 
 def _make(folder: Path) -> None:
