@@ -106,7 +106,14 @@ def replaced(*items: tuple[Any, str, Any]) -> Iterator[None]:
             setattr(owner, name, value)
 
 
-class _Inert:
+class _Attributes(type):
+    def __getattr__(cls, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _Attributes(name, (_Inert,), {})
+
+
+class _Inert(metaclass=_Attributes):
     """A class of a package that is not installed; it can be subclassed and made."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -115,9 +122,7 @@ class _Inert:
 
 class _StandIn(types.ModuleType):
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return type(name, (_Inert,), {})
+        return getattr(_Inert, name)
 
 
 class _Finder(MetaPathFinder, Loader):
