@@ -6,7 +6,8 @@ the peak-to-sidelobe ratio [6], and a frame with a low one is not learnt from.
 
 [1] Henriques et al., High-Speed Tracking with Kernelized Correlation Filters, TPAMI 2015.
 [2] Kiani Galoogahi et al., Learning Background-Aware Correlation Filters, ICCV 2017.
-[3] Lukezic et al., Discriminative Correlation Filter with Channel and Spatial Reliability, CVPR 2017.
+[3] Lukezic et al., Discriminative Correlation Filter with Channel and Spatial Reliability, CVPR
+    2017.
 [4] Li et al., Learning Spatial-Temporal Regularized Correlation Filters, CVPR 2018.
 [5] Danelljan et al., Discriminative Scale Space Tracking, TPAMI 2017.
 [6] Bolme et al., Visual Object Tracking using Adaptive Correlation Filters, CVPR 2010.
@@ -14,7 +15,8 @@ the peak-to-sidelobe ratio [6], and a frame with a low one is not learnt from.
 
 from __future__ import annotations
 
-from typing import Any, Sequence, Tuple
+from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,6 +39,8 @@ SMALLEST = 32.0  # side of the search window, pixels of the frame
 # the step size of ADMM and its growth, the ridge.
 TEMPORAL, STEP, GROWTH, RIDGE = 20.0, 0.01, 4.0, 0.01
 ITERATIONS = 2
+
+SCALE_RATE = 0.025
 
 
 class Dcf:
@@ -78,10 +82,10 @@ class Dcf:
         # a Gaussian of a sixteenth of the target's size [2], in cells
         wanted = _gaussian(CELLS, CELLS / padding / 16)
         self._wanted = self._to(np.fft.rfft2(np.outer(wanted, wanted)).real.astype(np.float32))
+        self._scale_step = scale_step
         self._steps = scale_step ** (np.arange(scales) - scales // 2.0)
         self._scale_window = np.hanning(scales + 2)[1:-1, None].astype(np.float32)
-        wanted_scale = np.fft.rfft(_gaussian(scales, scales / 16))
-        self._wanted_scale = wanted_scale.astype(np.complex64)[:, None]
+        self._wanted_scale = np.fft.rfft(_gaussian(scales, scales / 16))
         self._started = False
 
     def init(self, frame: Image, box: Sequence[float]) -> None:
@@ -99,7 +103,9 @@ class Dcf:
         columns, rows = (abs(np.arange(CELLS) - CELLS // 2) <= half + 0.5 for half in half_cells)
         self._mask = self._to(np.outer(rows, columns).astype(np.float32))
         self._started = False
+        self._scale_filter = self._scale_energy = np.zeros(1, np.float32)
         self._learn(frame)
+        self._rescale(frame)
         self._started = True
 
     def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
@@ -113,7 +119,7 @@ class Dcf:
         self._centre = np.array([cx, cy], float)
         self._size = np.maximum([w, h], 1.0)
 
-    def track(self, frame: Image) -> Tuple[Tuple[float, float, float, float], float]:
+    def track(self, frame: Image) -> tuple[tuple[float, float, float, float], float]:
         """The target's box in the next frame, and the peak-to-sidelobe ratio.
 
         Raises:
@@ -138,7 +144,7 @@ class Dcf:
         if self._torch and self._device.type == "cuda":
             self._torch.cuda.synchronize(self._device)
 
-    def describe(self) -> "dict[str, Any]":
+    def describe(self) -> dict[str, Any]:
         """Name, version and settings."""
         return {"name": "dcf", "version": "1", "settings": self._settings}
 
@@ -165,11 +171,13 @@ class Dcf:
         return np.fft.fftshift(response.cpu().numpy() if self._torch else response)
 
     def _learn(self, frame: Image) -> None:
-        """The filter g that minimises, over the window's frequencies, with T = TEMPORAL,
+        """Bring the filters up to date.
 
-            |g^H x - y|^2 + T |g - g_before|^2 + RIDGE |g|^2, g zero outside of the target
+        The filter g minimises, summed over the frequencies of the search window,
 
-        by ADMM as in [2] and [4], the solution for each frequency by Sherman-Morrison's formula.
+            |g^H x - y|^2 + TEMPORAL |g - g_before|^2 + RIDGE |g|^2, g zero outside of the target
+
+        by ADMM as in [2] and [4], with Sherman-Morrison's formula for each frequency.
         """
         x = self._channels(frame)
         energy = (x * x.conj()).real.sum(0)
@@ -188,39 +196,38 @@ class Dcf:
             dual = (dual + free - confined) / GROWTH
             step *= GROWTH
         self._filter = confined
-        self._learn_scale(frame)
 
     def _scale_features(self, frame: Image) -> Array:
         """Fourier transform over the scales of the target's features, complex64 [S/2 + 1, F]."""
         patches = [_crop(frame, self._centre, self._size * s, SCALE_SIDE) for s in self._steps]
-        found = _features(np.concatenate(patches))  # at once: 17 calls cost 4 times as much
+        found = _features(np.concatenate(patches))  # one call, since each has a cost of its own
         rows = found.reshape(len(found), len(patches), -1).swapaxes(0, 1).reshape(len(patches), -1)
         return np.fft.rfft(rows * self._scale_window, axis=0).astype(np.complex64)
 
-    def _learn_scale(self, frame: Image) -> None:
-        """Numerator and denominator of [5], Eq. 5, as running averages."""
-        z = self._scale_features(frame)
-        numerator, energy = z * self._wanted_scale.conj(), (z * z.conj()).real.sum(1)
-        rate = 0.025 if self._started else 1.0
-        before = (self._numerator, self._energy) if self._started else (0.0, 0.0)
-        self._numerator = (1 - rate) * before[0] + rate * numerator
-        self._energy = (1 - rate) * before[1] + rate * energy
-
     def _rescale(self, frame: Image) -> None:
-        """Multiply the size by the scale that responds most ([5], Eq. 6)."""
-        count = len(self._steps)
-        ridge = 0.01 * self._energy.mean() + 1e-6
-        z = (self._numerator.conj() * self._scale_features(frame)).sum(1) / (self._energy + ridge)
-        response = np.fft.fftshift(np.fft.irfft(z, count))
-        best = int(response.argmax())
-        offset = _vertex(*response[best - 1 : best + 2]) if 0 < best < count - 1 else 0.0
-        step = self._settings["scale_step"]
-        size = self._size * float(step) ** (best + offset - count // 2)
+        """Multiply the size by the scale that responds most ([5], Eqs. 5 and 6), and learn."""
+        z = self._scale_features(frame)
+        found = 0.0
+        if self._started:
+            ridge = 0.01 * self._scale_energy.mean() + 1e-6
+            product = (self._scale_filter.conj() * z).sum(1) / (self._scale_energy + ridge)
+            response = np.fft.fftshift(np.fft.irfft(product, len(self._steps)))
+            best = int(response.argmax())
+            inside = 0 < best < len(response) - 1
+            found = best - len(response) // 2
+            found += _vertex(*response[best - 1 : best + 2]) if inside else 0.0
+        # the features at the new size are those at the old one, shifted along the scales
+        phase = np.exp(-2j * np.pi * found * np.arange(len(z)) / len(self._steps))
+        wanted = (self._wanted_scale * phase).astype(np.complex64)[:, None]
+        rate = SCALE_RATE if self._started else 1.0
+        self._scale_filter = (1 - rate) * self._scale_filter + rate * z * wanted.conj()
+        self._scale_energy = (1 - rate) * self._scale_energy + rate * (z * z.conj()).real.sum(1)
+        size = self._size * self._scale_step**found
         if size.min() >= 1 and size.max() <= 2 * max(frame.shape[:2]):
             self._size = size
 
 
-def _torch(device: str) -> Tuple[Any, Any]:
+def _torch(device: str) -> tuple[Any, Any]:
     """Torch and its device, or nothing where NumPy is meant."""
     if device == "cpu":
         return None, None
@@ -261,17 +268,18 @@ def _features(patch: Image) -> Array:
     cells = (patch.shape[1] // CELL, patch.shape[0] // CELL)
     lab = cv2.cvtColor(patch, cv2.COLOR_BGR2LAB)
     grey = np.ascontiguousarray(lab[..., 0])
-    gradient = np.empty(grey.shape, np.complex64)
-    gradient.real = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)
-    gradient.imag = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1)
-    magnitude = np.abs(gradient)
-    turn = gradient / (magnitude + 1e-6)
-    turn *= turn  # opposite gradients are one orientation
+    dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)
+    dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1)
+    magnitude = cv2.magnitude(dx, dy)
+    # magnitude * (cos, sin) of 2 k angle, for opposite gradients are one orientation
     terms = [magnitude]
-    term = magnitude * turn
+    inverse = 1.0 / (magnitude + 1e-6)
+    cos, sin = (dx * dx - dy * dy) * inverse, 2.0 * dx * dy * inverse
+    twice = 2.0 * cos * inverse
+    before = magnitude, np.zeros_like(magnitude)
     for _ in range(ORDERS):
-        terms += [term.real.copy(), term.imag.copy()]
-        term *= turn
+        terms += [cos, sin]
+        before, (cos, sin) = (cos, sin), (twice * cos - before[0], twice * sin - before[1])
     series = np.stack([cv2.resize(t, cells, interpolation=cv2.INTER_AREA) for t in terms])
     histogram = np.maximum(_SERIES_TO_BINS @ series.reshape(len(series), -1), 0.0)
     histogram = histogram.reshape(BINS, cells[1], cells[0])
@@ -298,7 +306,7 @@ def _gaussian(count: int, sigma: float) -> Array:
     return np.fft.ifftshift(np.exp(-0.5 * ((np.arange(count) - count // 2) / sigma) ** 2))
 
 
-def _peak(response: Array) -> Tuple[Array, float]:
+def _peak(response: Array) -> tuple[Array, float]:
     """Where the response is largest (x, y in cells, between cells too), and the ratio of [6]."""
     r = response.astype(np.float64)
     row, column = (int(i) for i in np.unravel_index(r.argmax(), r.shape))
