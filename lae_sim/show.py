@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli import exit_status
@@ -153,14 +153,23 @@ def _warnings(report: Report, metadata: Metadata) -> Iterator[str]:
     if drift and (drift["within"] or 0) > 1.1:
         longer = f"takes {100 * drift['within'] - 100:.0f}% longer than the first"
         yield f"calls become slower within sequences: the last third {longer}"
-    taken = metadata.document.get("device", {}).get("readings", {})
-    # whatever another program wrote there
-    found = gathered(
-        sentence=lambda: throttling(
+    device = metadata.document.get("device", {})
+    taken = device.get("readings", {})
+    found = gathered(  # whatever another program wrote there
+        busy=lambda: _busy(taken["before"]["load"][0], device["cpu"]),
+        throttled=lambda: throttling(
             taken.get("before", {}), taken.get("during", []), taken.get("after", {})
-        )
+        ),
     )
     yield from found.values()
+
+
+def _busy(load: float, cpu: Mapping[str, Any]) -> str | None:
+    """Whether other programs were running when the profile began."""
+    cores = cpu.get("affinity") or cpu["cores"]
+    if load <= cores / 2:
+        return None
+    return f"the load before the profile was {load:.1f} on {cores} cores: other programs were busy"
 
 
 def _plot(reports: Sequence[Report], times: Sequence[Sequence[SequenceTimes]], path: str) -> None:

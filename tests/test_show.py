@@ -227,6 +227,8 @@ def test_what_the_profiler_writes_fits_the_schema() -> None:
     jsonschema.validate(document, schema)
     here = {**describe_device(), "readings": {"before": readings(), "during": [], "after": {}}}
     jsonschema.validate({**document, "device": here, "lae_sim": source_version()}, schema)
+    timing = {**document["timing"], "threads": {"opencv": 2}}
+    jsonschema.validate({**document, "timing": timing}, schema)
     wrong = {**document, "failures": [{"sequence": "s20"}]}
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(wrong, schema)
@@ -273,6 +275,17 @@ READINGS = st.fixed_dictionaries(
     {"before": READING, "during": ANYTHING | st.lists(READING), "after": READING}
 )
 OBJECT = st.dictionaries(st.text() | st.sampled_from(["name", "x_bytes"]), ANYTHING)
+
+
+def test_a_busy_machine_is_pointed_out() -> None:
+    document = profiled()[0].document
+    device = {"cpu": {"affinity": 2}, "readings": {"before": {"load": [4.5, 1, 1]}}}
+    metadata = Metadata.parse(json.dumps({**document, "device": device}).encode())
+    report, _ = show.describe(Trace(metadata, profiled()[1]), "trace")
+    assert (
+        "the load before the profile was 4.5 on 2 cores: other programs were busy"
+        in (report["warnings"])
+    )
 
 
 def test_odd_figures_are_shown() -> None:
