@@ -14,6 +14,7 @@ from lae_sim.errors import LaeError
 
 COMMANDS = {
     "convert": "make a trace from results that a tracker left (boxes and times)",
+    "render": "draw a replay over its frames, as a film or a contact sheet",
     "replay": "replay traces and score them, latency counted",
     "show": "say what a trace holds: provenance, times, stalls, drift",
 }
