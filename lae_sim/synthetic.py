@@ -86,7 +86,7 @@ _SCENES = (
     _Scene("race", colour=(40, 160, 215), speed=8, flight=14, shake=4, exposure=0.6, spin=0.5),
     _Scene("runner", size=30, aspect=0.6, corner=2.2, gait=0.4, covers=2, clutter=40, speed=4),
     _Scene("skater", size=44, aspect=0.55, corner=2.3, gait=0.35, turn=0.45, speed=6, spin=0.9),
-    _Scene("truck", size=70, aspect=0.42, colour=(170, 120, 50), reach=1.05, zoom=0.3, speed=6),
+    _Scene("truck", size=70, aspect=0.42, colour=(170, 120, 50), reach=1.15, zoom=0.3, speed=6),
     _Scene("van", size=58, colour=(200, 205, 210), turn=0.35, zoom=0.45, exposure=0.4, shake=4),
 )
 

@@ -60,6 +60,7 @@ def test_frames_are_the_same_in_any_order_and_from_threads():
     for name in ("herd", "van"):
         forward = [SEQUENCES[name].read(frame) for frame in frames]
         SEQUENCES["car"].read(0)  # another sequence between them
+        SEQUENCES[name].read(1)
         with ThreadPoolExecutor(3) as pool:
             again = list(pool.map(SEQUENCES[name].read, reversed(frames)))
         for image, other in zip(forward, reversed(again)):
@@ -126,6 +127,12 @@ def test_covers_hide_the_target_for_a_while():
         near += np.hypot(*(place - centre).T) < width / 2
     assert not near[:15].any()
     assert 9 < near.sum() < 70
+
+
+def test_where_the_target_is_out_of_view_there_is_no_truth():
+    gone = np.isnan(SEQUENCES["truck"].truth[:, 0])
+    assert 5 < gone.sum() < 80
+    assert not any(np.isnan(SEQUENCES[name].truth).any() for name in SEQUENCES if name != "truck")
 
 
 def test_no_such_frame():
