@@ -1,0 +1,215 @@
+"""NanoTrack, driven through OpenCV's network module from its two ONNX files.
+
+NanoTrack (H. Chu, the NanoTrack folder of https://github.com/HonglinChu/SiamTrackers) is a Siamese
+tracker: a small backbone, a depth-wise correlation, and a head that for each point of a grid says
+how likely the target is there and how far its four sides are. A frame is searched as described in
+Li et al., High Performance Visual Tracking with Siamese Region Proposal Network, CVPR 2018, and
+Li et al., SiamRPN++, CVPR 2019.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim.errors import LaeError
+from lae_sim.trackers.inputs import checked_box, checked_frame
+from lae_sim.trackers.protocol import Image
+
+TEMPLATE, SEARCH, STRIDE = 127, 255, 16  # pixels of the two inputs, and of a step of the output
+CONTEXT = 0.5
+SMALLEST = 10.0  # pixels, of a side of an answer
+
+# Side of the output: version, and what its authors set: penalty of a change of size or shape,
+# influence of the cosine window, rate at which the size follows. (Version 1 looks like 2.)
+_VERSIONS = {16: ("v2", 0.150, 0.490, 0.385), 15: ("v3", 0.138, 0.455, 0.348)}
+
+_UPSTREAM = "they are in NanoTrack/models of https://github.com/HonglinChu/SiamTrackers"
+
+
+class NanoTrack:
+    """NanoTrack version 2 or 3.
+
+    Args:
+        weights: folder of the two files ``*backbone*.onnx`` and ``*head*.onnx``.
+        backbone, head: the two files themselves, instead.
+        device: ``"cpu"``, or ``"cuda:0"`` where OpenCV was built with CUDA.
+
+    Raises:
+        LaeError: if a file is missing or not of NanoTrack, or the device cannot be used.
+    """
+
+    def __init__(
+        self, weights: str = "", backbone: str = "", head: str = "", device: str = "cpu"
+    ) -> None:
+        paths = [_find(weights, "backbone", backbone), _find(weights, "head", head)]
+        self._backbone, self._head = (_network(path, device) for path in paths)
+        self._device = device
+        self._digest = hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
+        try:
+            self._template = self._features(np.zeros((TEMPLATE, TEMPLATE, 3), np.uint8)).copy()
+            scores, _ = self._correlate(np.zeros((SEARCH, SEARCH, 3), np.uint8))
+            count = scores.shape[-1]
+            self._version, self._penalty, self._influence, self._rate = _VERSIONS[count]
+        except (cv2.error, KeyError, ValueError) as error:
+            names = " and ".join(str(path) for path in paths)
+            raise LaeError(
+                f"{names} are not a backbone and a head of NanoTrack v2 or v3"
+            ) from error
+        window = np.hanning(count)
+        self._window = np.outer(window, window)
+        self._points = STRIDE * (np.arange(count) - count // 2.0)
+        self._started = False
+
+    def init(self, frame: Image, box: Sequence[float]) -> None:
+        """Take the target's features from its first frame.
+
+        Raises:
+            LaeError: if the frame is no image, or the box no box.
+        """
+        frame = checked_frame(frame)
+        x, y, w, h = checked_box(box)
+        self._centre, self._size = np.array([x + w / 2, y + h / 2]), np.array([w, h])
+        self._mean = cv2.mean(frame)
+        side = round(self._context_side())
+        self._template = self._features(self._crop(frame, side, TEMPLATE)).copy()
+        self._started = True
+
+    def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
+        """Search the next frame around this centre for a target of this size.
+
+        Raises:
+            LaeError: if a number is not finite.
+        """
+        if not np.isfinite([cx, cy, w, h]).all():
+            raise LaeError(f"cannot search around {cx, cy} for a target of {w, h} pixels")
+        self._centre, self._size = np.array([cx, cy], float), np.maximum([w, h], 1.0)
+
+    def track(self, frame: Image) -> tuple[tuple[float, float, float, float], float]:
+        """The target's box in the next frame, and its probability as the network sees it.
+
+        Raises:
+            LaeError: if the frame is no image, or ``init`` was not called.
+        """
+        frame = checked_frame(frame)
+        if not self._started:
+            raise LaeError("nanotrack: init must come before track")
+        edge = np.array(frame.shape[1::-1], float)
+        self._centre, self._size = self._inside(self._centre, edge), np.minimum(self._size, edge)
+        zoom = TEMPLATE / self._context_side()
+        patch = self._crop(frame, round(SEARCH / zoom), SEARCH)
+        scores, sides = self._correlate(patch)
+        left, top, right, bottom = sides.astype(np.float64)
+        width, height = np.maximum(left + right, 1e-3), np.maximum(top + bottom, 1e-3)
+        # SiamRPN, Eq. 14: against changes of shape and of size, both larger than 1
+        w, h = self._size * zoom
+        shape, size = (width / height) / (w / h), _overall(width, height) / _overall(w, h)
+        change = np.maximum(shape, 1 / shape) * np.maximum(size, 1 / size)
+        penalty = np.exp(self._penalty * (1 - change))
+        wanted = penalty * scores * (1 - self._influence) + self._window * self._influence
+        best = np.unravel_index(int(wanted.argmax()), wanted.shape)
+        row, column = best
+        offset = np.array(
+            [
+                self._points[column] + (right[best] - left[best]) / 2,
+                self._points[row] + (bottom[best] - top[best]) / 2,
+            ]
+        )
+        rate = penalty[best] * scores[best] * self._rate
+        found = np.array([width[best], height[best]]) / zoom
+        self._centre = self._inside(self._centre + offset / zoom, edge)
+        size = (1 - rate) * self._size + rate * found
+        self._size = np.clip(size, SMALLEST, np.maximum(edge, SMALLEST))
+        (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
+        return (cx - w / 2, cy - h / 2, w, h), float(scores[best])
+
+    def describe(self) -> dict[str, Any]:
+        """Name, version, settings, and the digest of the weights: SHA-256 of the two files."""
+        return {
+            "name": "nanotrack",
+            "version": self._version,
+            "settings": {
+                "device": self._device,
+                "penalty_k": self._penalty,
+                "window_influence": self._influence,
+                "lr": self._rate,
+            },
+            "weights_digest": self._digest,
+        }
+
+    def _inside(self, centre: npt.NDArray[Any], edge: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return np.clip(centre, 0.0, edge)
+
+    def _context_side(self) -> float:
+        """Side of the square around the target with its context, pixels (SiamRPN++, 4.1)."""
+        return _overall(*self._size)
+
+    def _crop(self, frame: Image, side: int, pixels: int) -> Image:
+        """A square around the centre as uint8 [pixels, pixels, 3], filled with the mean colour.
+
+        The square begins at a whole pixel, as where the network was trained.
+        """
+        left, top = np.floor(self._centre - side / 2 - 0.5)
+        zoom = pixels / max(side, 1)
+        start = [0.5 * zoom - 0.5 - zoom * left, 0.5 * zoom - 0.5 - zoom * top]
+        matrix = np.array([[zoom, 0, start[0]], [0, zoom, start[1]]])
+        return cv2.warpAffine(frame, matrix, (pixels, pixels), borderValue=self._mean)  # type: ignore[return-value]
+
+    def _features(self, patch: Image) -> npt.NDArray[np.float32]:
+        self._backbone.setInput(cv2.dnn.blobFromImage(patch))
+        return np.asarray(self._backbone.forward(), np.float32)
+
+    def _correlate(self, patch: Image) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        """Probability [n, n], and distances left, top, right, bottom [4, n, n], pixels of patch."""
+        self._head.setInput(self._template, "input1")
+        self._head.setInput(self._features(patch), "input2")
+        (classes,), (sides,) = self._head.forward(["output1", "output2"])
+        background, target = classes.astype(np.float64)
+        return 1 / (1 + np.exp(np.clip(background - target, -500, 500))), sides
+
+
+def _overall(w: Any, h: Any) -> Any:
+    """Side of the square of a target's size and its context (SiamRPN, Eq. 15)."""
+    pad = (w + h) * CONTEXT
+    return np.sqrt((w + pad) * (h + pad))
+
+
+def _find(folder: str, part: str, given: str) -> Path:
+    """The file of one of the two networks."""
+    if given:
+        found = [Path(given)] if Path(given).is_file() else []
+        sought = given
+    else:
+        sought = f"{Path(folder) / f'*{part}*.onnx'}" if folder else f"{part}=FILE"
+        found = sorted(Path(folder).glob(f"*{part}*.onnx")) if folder else []
+    if len(found) != 1:
+        problem = "more than one" if found else "no"
+        raise LaeError(
+            f"nanotrack: {problem} file {sought}; give weights=FOLDER, or backbone=FILE and "
+            f"head=FILE (two ONNX files; {_UPSTREAM})"
+        )
+    return found[0]
+
+
+def _network(path: Path, device: str) -> Any:
+    try:
+        network = cv2.dnn.readNet(str(path))
+    except cv2.error as error:
+        raise LaeError(f"{path}: not a network that OpenCV {cv2.__version__} can read") from error
+    name, _, number = device.partition(":")
+    if name == "cuda":
+        backend, target = cv2.dnn.DNN_BACKEND_CUDA, cv2.dnn.DNN_TARGET_CUDA
+        if target not in cv2.dnn.getAvailableTargets(backend):
+            raise LaeError(f"nanotrack: this build of OpenCV ({cv2.__version__}) has no CUDA")
+        cv2.cuda.setDevice(int(number or 0))
+        network.setPreferableBackend(backend)
+        network.setPreferableTarget(target)
+    elif device != "cpu":
+        raise LaeError(f"nanotrack: the device {device!r} is neither 'cpu' nor 'cuda:NUMBER'")
+    return network
