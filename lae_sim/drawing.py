@@ -86,7 +86,7 @@ def film_strip(pictures: Sequence[Image], columns: int | None = None) -> Image:
     if len({picture.shape for picture in pictures}) != 1:
         raise LaeError("a film strip needs pictures of one size, and at least one")
     height, width = pictures[0].shape[:2]
-    across = columns or round(np.sqrt(len(pictures) * height / width * 16 / 9))
+    across = columns or int(np.ceil(np.sqrt(len(pictures) * height / width * 16 / 9)))
     across = min(max(across, 1), len(pictures))
     gap = max(width // 160, 1)
     rows = -(-len(pictures) // across)
@@ -116,9 +116,11 @@ def follow(boxes: Floats, size: tuple[int, int]) -> npt.NDArray[np.int64]:
     axes = [np.interp(frames, frames[known], axis[known]) for axis in middles[:, 0].T]
     middle = np.stack(axes, axis=1)[:, None]
     lost = np.abs(middles - middle).max(axis=2) > 4 * boxes[:, :1, 2:].max(axis=2)
-    reach = np.fmax(high - middle, middle - low).max(axis=2, initial=0, where=~lost[..., None])
     whole = np.array(size)
-    needed = np.quantile((reach[known] / whole.min()), 0.98)
+    reach = np.fmax(high - middle, middle - low) / whole
+    needed = np.quantile(
+        reach[known].max(axis=(1, 2), initial=0, where=~lost[known, :, None]), 0.98
+    )
     window = np.ceil(whole * np.clip(2.5 * needed, 64 / whole.max(), 1)).astype(np.int64)
     corner = np.clip(np.rint(middle[:, 0] - window / 2).astype(np.int64), 0, whole - window)
     return np.concatenate([corner, corner + window], axis=1)
