@@ -87,9 +87,9 @@ def film_strip(pictures: Sequence[Image], columns: int | None = None) -> Image:
         raise LaeError("a film strip needs pictures of one size, and at least one")
     height, width = pictures[0].shape[:2]
     across = columns or int(np.ceil(np.sqrt(len(pictures) * height / width * 16 / 9)))
-    across = min(max(across, 1), len(pictures))
     gap = max(width // 160, 1)
     rows = -(-len(pictures) // across)
+    across = columns or -(-len(pictures) // rows)  # as few empty places as can be
     strip = np.full((rows * (height + gap) - gap, across * (width + gap) - gap, 3), 255, np.uint8)
     for number, picture in enumerate(pictures):
         top, left = (number // across) * (height + gap), (number % across) * (width + gap)

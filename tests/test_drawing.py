@@ -120,6 +120,7 @@ def test_a_film_strip_is_a_grid() -> None:
     assert (strip[37:, 130:] == 255).all()
     assert film_strip(pictures[:1]).shape == (36, 64, 3)
     assert film_strip([grey()] * 12).shape[:2] == (3 * 360 + 8, 4 * 640 + 12)  # about 16:9
+    assert film_strip([grey()] * 4).shape[:2] == (2 * 360 + 4, 2 * 640 + 4)  # none left empty
     with pytest.raises(LaeError, match="one size"):
         film_strip([pictures[0], pictures[1][1:]])
     with pytest.raises(LaeError, match="at least one"):
