@@ -270,7 +270,7 @@ def _features(patch: Image) -> Array:
     grey = np.ascontiguousarray(lab[..., 0])
     dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)
     dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1)
-    magnitude = cv2.magnitude(dx, dy)
+    magnitude = np.sqrt(dx * dx + dy * dy)  # cv2.magnitude depends on the alignment of memory
     # magnitude * (cos, sin) of 2 k angle, for opposite gradients are one orientation
     terms = [magnitude]
     inverse = 1.0 / (magnitude + 1e-6)
