@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lae_sim.clock import Clock, parse_duration
 from lae_sim.device import describe_device, readings, source_version
 from lae_sim.engine import Service
@@ -207,6 +209,26 @@ def write_pass(task: Pass, journal: Journal, failures: list[dict[str, Any]]) -> 
     metadata = Metadata.of(document)
     write_trace(Trace(metadata, journal.recordings(task.name)), task.path)
     return metadata
+
+
+def summary(path: Path) -> dict[str, Any]:
+    """What a profiled trace holds, in short: counts, and times in ms."""
+    trace = read_trace(path)
+    recordings = list(trace)
+    calls = np.concatenate([r.elapsed_ns[1:][r.elapsed_ns[1:] >= 0] for r in recordings])
+    entries = trace.metadata.document["sequences"].values()
+    return {
+        "trace": str(path),
+        "schedule": trace.metadata.document["schedule"],
+        "timing": trace.metadata.document["timing"]["source"],
+        "sequences": len(recordings),
+        "world_frames": sum(map(len, recordings)),
+        "processed": len(recordings) + len(calls),
+        "lost": sum(entry["lost"] for entry in entries),
+        "init_ms": float(np.mean([r.elapsed_ns[0] for r in recordings])) / 1e6,
+        "median_ms": float(np.median(calls)) / 1e6 if len(calls) else None,
+        "p95_ms": float(np.percentile(calls, 95)) / 1e6 if len(calls) else None,
+    }
 
 
 def warm_up(tracker: TimedTracker, sequence: ImageSequence, calls: int) -> None:

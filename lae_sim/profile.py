@@ -163,7 +163,7 @@ def _profile(arguments: argparse.Namespace) -> int:
 
     from lae_sim.datasets import find_dataset
     from lae_sim.journal import Journal
-    from lae_sim.passes import run_pass, write_pass
+    from lae_sim.passes import run_pass, summary, write_pass
 
     dataset = find_dataset(
         arguments.dataset, arguments.root, arguments.sequence, arguments.box, arguments.fps
@@ -206,7 +206,7 @@ def _profile(arguments: argparse.Namespace) -> int:
         raise KeyboardInterrupt
     if not written:
         raise LaeError("no sequence could be profiled")
-    reports = [_report(task.path) for task in written]
+    reports = [summary(task.path) for task in written]
     if arguments.json:
         print(json.dumps({"traces": reports, "failures": failed}, indent=2))
     else:
@@ -246,6 +246,8 @@ def _tracker(arguments: argparse.Namespace) -> TimedTracker:
             threads=arguments.threads,
             timeout=arguments.frame_timeout / NS_PER_SECOND,
         )
+    if arguments.translate and arguments.pre_forecaster is None:
+        raise LaeError("--translate shifts frames to where a --pre-forecaster predicts the target")
     needed = arguments.pre_forecaster is not None and not tracker.sets_search
     return Translated(tracker) if arguments.translate or needed else tracker
 
@@ -273,10 +275,7 @@ def _passes(
     document = base_document(
         arguments.tracker, tracker, dataset.name, clock, arguments.warmup, includes
     )
-    common: dict[str, Any] = {
-        "tracker": tracker,
-        "include_decode": arguments.include_decode,
-    }
+    common: dict[str, Any] = {"tracker": tracker, "include_decode": arguments.include_decode}
     if arguments.pre_forecaster is not None:
         common["pre_forecaster"] = load_forecaster(arguments.pre_forecaster)
         search = "translation" if isinstance(tracker, Translated) else "native"
@@ -329,30 +328,6 @@ def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """What decides the results, for a resumed run to compare."""
     given = {k: str(v) for k, v in vars(arguments).items() if k not in ("out", "resume", "json")}
     return {"lae_sim": __version__, **given}
-
-
-def _report(path: Path) -> dict[str, Any]:
-    """What a trace holds, in short."""
-    import numpy as np
-
-    from lae_sim.trace import read_trace
-
-    trace = read_trace(path)
-    recordings = list(trace)
-    calls = np.concatenate([r.elapsed_ns[1:][r.elapsed_ns[1:] >= 0] for r in recordings])
-    entries = trace.metadata.document["sequences"].values()
-    return {
-        "trace": str(path),
-        "schedule": trace.metadata.document["schedule"],
-        "timing": trace.metadata.document["timing"]["source"],
-        "sequences": len(recordings),
-        "world_frames": sum(map(len, recordings)),
-        "processed": len(recordings) + len(calls),
-        "lost": sum(entry["lost"] for entry in entries),
-        "init_ms": float(np.mean([r.elapsed_ns[0] for r in recordings])) / 1e6,
-        "median_ms": float(np.median(calls)) / 1e6 if len(calls) else None,
-        "p95_ms": float(np.percentile(calls, 95)) / 1e6 if len(calls) else None,
-    }
 
 
 def _print_summary(reports: Sequence[Mapping[str, Any]]) -> None:

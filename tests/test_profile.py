@@ -303,6 +303,7 @@ def test_a_full_disk_is_an_error_and_leaves_no_trace(here: Path) -> None:
         ((*MINE, "--timing", "nothing.parquet"), "nothing.parquet"),
         ((*MINE, "--timing", "constant:47"), "unit"),
         ((*MINE, "--stride", "1"), "from 2"),
+        ((*MINE, "--translate"), "pre-forecaster"),
         ((*MINE, "--pre-forecaster", "crystal-ball"), "crystal-ball"),
         ((*MINE, "--out", "trace.txt"), "parquet"),
         ((*MINE, "--out", "no/folder/t.parquet"), "no/folder"),
@@ -369,7 +370,7 @@ def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     assert "strided" in out
-    profile(here, *options[:-1], "u.parquet", "--translate", "--option", "reach=9")
+    profile(here, *options[:-1], "u.parquet", "--option", "reach=9")
     process = start(here, "u.parquet", *arguments[1:], module="fidelity")
     _, err = process.communicate(timeout=120)
     assert process.returncode == 2
