@@ -64,7 +64,7 @@ def import_from(checkout: Path, module: str) -> types.ModuleType:
     package = sys.modules.get(module.partition(".")[0])
     if package is not None:
         folders = [Path(folder).resolve() for folder in getattr(package, "__path__", [])]
-        if not any(checkout in folder.parents for folder in folders):
+        if all(folder.parent != checkout for folder in folders):
             raise LaeError(
                 f"{checkout}: this process has imported another {package.__name__!r}; "
                 "run each checkout in a process of its own"

@@ -35,7 +35,7 @@ _UNUSED = ("colorama", "matplotlib", "pycocotools", "tensorboardX", "tqdm", "vis
 
 
 class PySot:
-    """A tracker of a pysot checkout; it takes frames as OpenCV has them.
+    """A tracker of a pysot checkout; the toolkit's configuration is global: one to a process.
 
     SiamMask's box is the axis-aligned one that the toolkit reports as ``bbox``; its mask and
     polygon are computed, as the toolkit does, and dropped.

@@ -57,11 +57,14 @@ def precise_roi_pooling(features: Any, rois: Any, size: tuple[int, int], scale: 
     """
     across, wide = _hat_integrals(rois[:, 1] * scale, rois[:, 3] * scale, size[1], features, 3)
     down, high = _hat_integrals(rois[:, 2] * scale, rois[:, 4] * scale, size[0], features, 2)
-    if len(features) > 1:
-        features = features[rois[:, 0].long()]
-    sums = down[:, None] @ features @ across[:, None].transpose(-1, -2)
+    images, channels, height, width = features.shape
+    # one matrix product for all regions and channels where they are of one image
+    planes = features.transpose(1, 2).reshape(images, height, channels * width)
+    planes = planes[0] if images == 1 else planes[rois[:, 0].long()]
+    rows = (down @ planes).reshape(len(rois), size[0], channels, width)
+    sums = (rows @ across[:, None].transpose(-1, -2)).transpose(1, 2)
     area = (wide * high)[:, None, None, None]
-    return sums.where(area > 0, 0 * sums) / area.where(area > 0, area.new_ones(()))
+    return sums / area.where(area > 0, area.new_ones(()))  # without area the sums are 0 as well
 
 
 def _hat_integrals(start: Any, end: Any, bins: int, features: Any, axis: int) -> tuple[Any, Any]:
