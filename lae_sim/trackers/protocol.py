@@ -26,6 +26,7 @@ class Tracker(Protocol):
 
     A tracker may also have
 
+    - ``prepare()``: get ready for ``init``, untimed;
     - ``set_search(cx, cy, w, h)``: search the next frame around this centre for a target of this
       size (float, pixels) instead of where it was last seen;
     - ``sync()``: wait for the device to finish; the stopwatch calls it before each reading (for
