@@ -86,6 +86,7 @@ class Dcf:
         self._steps = scale_step ** (np.arange(scales) - scales // 2.0)
         self._scale_window = np.hanning(scales + 2)[1:-1, None].astype(np.float32)
         self._wanted_scale = np.fft.rfft(_gaussian(scales, scales / 16))
+        self._filter: Any = None  # complex64 [C, CELLS, CELLS/2 + 1]
         self._started = False
 
     def init(self, frame: Image, box: Sequence[float]) -> None:
@@ -186,7 +187,9 @@ class Dcf:
         wanted = x * self._wanted
         if self._started:
             wanted = wanted + temporal * self._filter
-        step, confined, dual = STEP * unit, 0.0, 0.0
+        step = STEP * unit
+        confined: Any = 0.0
+        dual: Any = 0.0
         for _ in range(ITERATIONS):
             v = wanted + step * (confined - dual)
             inverse = (x.conj() * v).sum(0) / (step + temporal + energy)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Sequence, Tuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def checked_frame(frame: Any) -> Image:
     return array
 
 
-def checked_box(box: Sequence[float]) -> Tuple[float, float, float, float]:
+def checked_box(box: Sequence[float]) -> tuple[float, float, float, float]:
     """The box ``x, y, w, h`` as floats, no thinner than a pixel.
 
     Raises:

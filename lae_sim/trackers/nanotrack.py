@@ -143,12 +143,12 @@ class NanoTrack:
             "weights_digest": self._digest,
         }
 
-    def _inside(self, centre: npt.NDArray[Any], edge: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def _inside(self, centre: npt.NDArray[Any], edge: npt.NDArray[Any]) -> Any:
         return np.clip(centre, 0.0, edge)
 
     def _context_side(self) -> float:
         """Side of the square around the target with its context, pixels (SiamRPN++, 4.1)."""
-        return _overall(*self._size)
+        return float(_overall(*self._size.tolist()))
 
     def _crop(self, frame: Image, side: int, pixels: int) -> Image:
         """A square around the centre as uint8 [pixels, pixels, 3], filled with the mean colour.
@@ -159,7 +159,8 @@ class NanoTrack:
         zoom = pixels / max(side, 1)
         start = [0.5 * zoom - 0.5 - zoom * left, 0.5 * zoom - 0.5 - zoom * top]
         matrix = np.array([[zoom, 0, start[0]], [0, zoom, start[1]]])
-        return cv2.warpAffine(frame, matrix, (pixels, pixels), borderValue=self._mean)  # type: ignore[return-value]
+        patch = cv2.warpAffine(frame, matrix, (pixels, pixels), borderValue=self._mean)
+        return np.asarray(patch, np.uint8)
 
     def _features(self, patch: Image) -> npt.NDArray[np.float32]:
         self._backbone.setInput(cv2.dnn.blobFromImage(patch))
