@@ -8,6 +8,9 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
+PARTED_IOU = 0.5
+"""Two answers for one frame that overlap less are not of the same place."""
+
 
 def iou(a: Floats, b: Floats) -> Floats:
     """Intersection over union, row by row.

@@ -43,6 +43,7 @@ class Evaluation:
         missing: world frames of each without a box in the trace, int64 [S].
         processed: processed frames of each, int64 [S].
         departures: see :class:`lae_sim.run.Run`, int64 [S].
+        disagreement: see :class:`lae_sim.run.Run`, float64 [S].
         init_ns: time of the initialisation, int64 [S].
         calls_ns: total time of the other calls, int64 [S].
         calls_hz: sum of 1/elapsed over the other calls, per second, [S]; infinite if one took 0.
@@ -59,6 +60,7 @@ class Evaluation:
     missing: Ints
     processed: Ints
     departures: Ints
+    disagreement: Floats
     init_ns: Ints
     calls_ns: Ints
     calls_hz: Floats
@@ -139,6 +141,7 @@ def _evaluate_group(
         missing=np.array([np.isnan(run.recording.boxes[:, 0]).sum() for run in runs], np.int64),
         processed=np.diff(pairing.offsets),
         departures=np.array([run.departures for run in runs], np.int64),
+        disagreement=np.array([run.disagreement for run in runs]),
         init_ns=np.array([run.schedule.elapsed_ns[0] for run in runs], np.int64),
         calls_ns=np.array([elapsed.sum() for elapsed in calls], np.int64),
         calls_hz=np.array([_rates(elapsed).sum() for elapsed in calls]),

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from lae_sim.trace import Trace
 
 PROGRAM = "lae-sim fidelity"
-PARTED_IOU = 0.5
-
 Row = dict[str, Any]
 
 GROUP = ("closed_loop", "forecaster", "replay")
@@ -51,6 +49,7 @@ SEQUENCE_COLUMNS = {
     "dp20": "DP",
     "d_dp20": "d",
     "parted": "parted at",
+    "disagreement": "disagree",
 }
 
 DESCRIPTION = """\
@@ -120,6 +119,8 @@ def _fidelity(arguments: argparse.Namespace) -> None:
 
 def _compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
     """One closed loop against replays at its times: a row per forecaster, replay and sequence."""
+    import numpy as np
+
     from lae_sim.evaluation import evaluate
     from lae_sim.metrics import find_convention
     from lae_sim.run import replay_trace
@@ -162,7 +163,8 @@ def _compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
                     "dp20": float(dp),
                     "d_dp20": float(dp - closed_dp),
                     "parted": _parted(run, closed_run),
-                    "approximate": run.departures,
+                    "approximate_outputs": run.departures,
+                    "disagreement": None if np.isnan(run.disagreement) else run.disagreement,
                 }
 
 
@@ -192,7 +194,7 @@ def _parted(replay: Run, closed: Run) -> int | None:
     """The first processed frame whose boxes in replay and closed loop overlap less than half."""
     import numpy as np
 
-    from lae_sim.boxes import iou
+    from lae_sim.boxes import PARTED_IOU, iou
 
     apart = np.flatnonzero(iou(replay.boxes, closed.boxes) < PARTED_IOU)
     return int(closed.schedule.frames[apart[0]]) if len(apart) else None

@@ -11,6 +11,8 @@ from lae_sim.metadata import Metadata
 from lae_sim.metrics import Convention
 from lae_sim.run import Run
 
+TRUSTED_DISAGREEMENT = 0.1
+
 
 class SkippedStalls:
     """Counts recorded stalls that no call met, since the frame was skipped."""
@@ -60,6 +62,13 @@ def notes_on(
         notes.append("no offline score: some sequences lack the boxes of skipped frames")
     if at_arrival:
         notes.append("vot-realtime skips frames but never scores latency")
+    parted = np.flatnonzero(evaluation.disagreement > TRUSTED_DISAGREEMENT)
+    if len(parted):
+        worst = sequences[int(np.nanargmax(evaluation.disagreement))]
+        notes.append(
+            f"do not trust the replay of {len(parted)} of {len(sequences)} sequences, such as "
+            f"{worst!r}: the passes disagree on more than {TRUSTED_DISAGREEMENT:.0%} of its frames"
+        )
     unknown = sum(metadata.image_size(name) is None for name in sequences)
     if unknown and "kalman-lae-pvt" in forecasters:
         notes.append(

@@ -76,6 +76,8 @@ def trace_report(
                         "world_frames": int(evaluation.frames[i]),
                         "processed": int(evaluation.processed[i]),
                         "mismatch_sum": int(evaluation.mismatch_sum[i, s]),
+                        "approximate_outputs": int(evaluation.departures[i]),
+                        "disagreement": _number(evaluation.disagreement[i]),
                         "offline_auc": _number(evaluation.offline["auc"][i]),
                         "offline_dp20": _number(evaluation.offline["dp20"][i]),
                         **_scores(evaluation, forecasters, f, s, slice(i, i + 1)),
@@ -221,12 +223,17 @@ def settings_text(report: Report) -> str:
     if report["times_note"] is not None:
         lines.append(f"  times: {report['times_note']}")
     lines += [f"  {note}" for note in report["notes"]]
+    share = f"{report['approximate_outputs']:,} outputs ({100 * report['approximate_share']:.3g}%)"
     if report["exact"]:
         lines.append("  exact: every output follows the same frame as when it was recorded")
+    elif report["strided"]:
+        lines.append(
+            f"  approximate: boxes come from passes of {1 + len(report['strided'])} strides, the "
+            f"nearest to the frames\n  skipped; {share} follow another output than in their pass"
+        )
     else:
         lines.append(
-            f"  approximate: {report['approximate_outputs']:,} outputs "
-            f"({100 * report['approximate_share']:.3g}%) follow another frame than when recorded; "
+            f"  approximate: {share} follow another frame than when recorded; "
             "a stateful\n  tracker would have seen larger motion there, so this is optimistic"
         )
     return "\n".join(lines)
@@ -247,13 +254,14 @@ def attribute_table(report: Report, shown_sigmas: Sequence[float]) -> str:
 def sequence_table(report: Report, shown_sigmas: Sequence[float]) -> str:
     """One line per sequence and forecaster."""
     header = ["sequence", "forecaster", "sigma", "AUC", "offline", "DP@20", "offline"]
-    header += ["frames", "processed", "mismatch"]
+    header += ["frames", "processed", "mismatch", "approximate", "disagree"]
     lines = [
         [one["sequence"], result["forecaster"], f"{result['sigma']:g}"]
         + [_score(one["auc"]), _score(one["offline_auc"])]
         + [_score(one["dp20"]), _score(one["offline_dp20"])]
         + [str(one["world_frames"]), str(one["processed"])]
         + [f"{one['mismatch_sum'] / one['world_frames']:.3f} fr"]
+        + [str(one["approximate_outputs"]), _percent(one["disagreement"])]
         for result in _shown(report, shown_sigmas)
         for one in result["per_sequence"]
     ]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 
-from lae_sim.boxes import Floats
+from lae_sim.boxes import PARTED_IOU, Floats, iou
 from lae_sim.clock import Clock
 from lae_sim.engine import Ints, Policy, Schedule, simulate
 from lae_sim.errors import LaeError
@@ -30,15 +30,16 @@ class Run:
         departures: processed frames (the first left out) that did not follow the same frame, with
             the same box, when they were recorded. Above 0, the boxes of a stateful tracker are an
             approximation: it would have seen other motion.
-        passes: boxes of the processed frames in each pass that boxes were taken from, by its
-            stride, float64 [n, 4]; empty without strided passes.
+        disagreement: share of processed frames where the boxes of two of the passes concerned
+            overlap less than half, 0 if the replay is exact, NaN without strided passes. Where it
+            is high the tracker's luck depends on the frames that it sees.
     """
 
     recording: Recording
     schedule: Schedule
     boxes: Floats
     departures: int
-    passes: Mapping[int, Floats]
+    disagreement: float = np.nan
 
     def __len__(self) -> int:
         """Number of world frames T."""
@@ -82,7 +83,7 @@ def replay_sequence(
         return _from_passes({stride: recording, **strided}, recording, schedule)
     boxes = _boxes(recording, frames)
     followed = _followed(recording, frames, stride)
-    return Run(recording, schedule, boxes, int(np.count_nonzero(followed != frames[:-1])), {})
+    return Run(recording, schedule, boxes, int(np.count_nonzero(followed != frames[:-1])))
 
 
 def _boxes(recording: Recording, frames: Ints) -> Floats:
@@ -118,8 +119,11 @@ def _from_passes(passes: Mapping[int, Recording], recording: Recording, schedule
     rest = np.arange(len(frames) - 1)
     before = stacked[chosen[1:], rest]  # what the pass of an output answered for the one before
     same = (followed[chosen[1:], rest] == frames[:-1]) & (before == boxes[:-1]).all(axis=1)
-    used = {int(strides[k]): stacked[k] for k in np.unique(chosen)}
-    return Run(recording, schedule, boxes, int(np.count_nonzero(~same)), used)
+    departures = int(np.count_nonzero(~same))
+    concerned = stacked[: chosen.max() + 1] if departures else stacked[:1]
+    apart = [iou(a, b) < PARTED_IOU for a, b in combinations(concerned, 2)]
+    disagreement = float(np.mean(np.any(apart, axis=0))) if apart else 0.0
+    return Run(recording, schedule, boxes, departures, disagreement)
 
 
 def replay_trace(

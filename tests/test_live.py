@@ -22,7 +22,7 @@ from lae_sim.live import LiveRun, run_every_frame, run_real_time, search_of
 from lae_sim.metadata import Metadata
 from lae_sim.policies import every, fifo, latest, shrinking_tail, vot_realtime
 from lae_sim.recording import Recording
-from lae_sim.run import Run, replay_trace
+from lae_sim.run import Run, replay_sequence, replay_trace
 from lae_sim.timed import Answer, TrackerFailure
 from lae_sim.trace import Trace, read_trace, write_trace
 
@@ -260,6 +260,8 @@ def test_strided_passes_make_a_replay_at_their_stride_exact(stride: int, at: int
     np.testing.assert_array_equal(found.schedule.frames, closed.frames)
     np.testing.assert_array_equal(found.boxes, closed.recording.boxes[closed.frames])
     assert found.departures == 0 < bare.departures
+    assert found.disagreement == 0
+    assert np.isnan(bare.disagreement)
     (itself,) = replay_trace(strided[stride - 2], timing=timing)
     np.testing.assert_array_equal(itself.boxes, found.boxes)
     assert itself.departures == 0
@@ -270,3 +272,18 @@ def test_each_stride_once() -> None:
     trace = Trace(Metadata.new("30", "every-frame"), [recording])
     with pytest.raises(LaeError, match="stride"):
         list(replay_trace(trace, strided=[trace]))
+
+
+def test_passes_that_part_are_told() -> None:
+    """Steps of 1 and 2 by turns: boxes by turns of two passes, which disagree from frame 8 on."""
+    near, far = [[1.0, 1, 9, 9]] * 16, [[1.0, 1, 9, 9]] * 8 + [[50.0, 1, 9, 9]] * 8
+    elapsed = [50_000_000] * 16
+    whole = Recording.new("a", near, near, elapsed)
+    run = replay_sequence(whole, CLOCK, strided={2: Recording.new("a", near, far, elapsed)})
+    frames = run.schedule.frames
+    assert frames.tolist() == [0, 1, 3, 4, 6, 7, 9, 10, 12, 13, 15]
+    expected = [(far if frame % 3 == 0 and frame else near)[frame] for frame in frames]
+    np.testing.assert_array_equal(run.boxes, expected)
+    assert run.disagreement == pytest.approx(5 / 11)
+    # 10, 12, 13 and 15 followed other boxes of 9, 10, 12 and 13 in their passes
+    assert run.departures == 4
