@@ -46,7 +46,7 @@ class ModelBuilder(torch.nn.Module):
         super().__init__()
         self.norm = torch.nn.BatchNorm2d(cfg.GAIN).cuda()
     def template(self, crop):
-        assert not self.training and not cfg.CUDA
+        assert not self.training
         self.mean = crop.mean().cuda()
 """,
     "tracker/__init__.py": "",
@@ -136,6 +136,24 @@ def test_weights_are_loaded(checkout: Path) -> None:
     assert not network.training
 
 
+def test_devices(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Any] = []
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", calls.append)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: calls.append("sync"))
+    for kind in (torch.Tensor, torch.nn.Module):
+        monkeypatch.setattr(kind, "cuda", lambda value: value)
+    monkeypatch.setattr(torch.nn.Module, "to", lambda module, device: calls.append(device))
+    tracker = PySot(**options(checkout, device="cuda:1"))
+    tracker.sync()
+    assert calls == [1, "cuda:1", "sync"]
+    assert sys.modules["pysot.core.config"].cfg.CUDA is True
+    monkeypatch.undo()
+    PySot(**options(checkout)).sync()
+    assert calls == [1, "cuda:1", "sync"]
+    assert sys.modules["pysot.core.config"].cfg.CUDA is False
+
+
 def test_no_code_of_a_snapshot_is_run(checkout: Path) -> None:
     class Bomb:
         def __reduce__(self) -> Any:
@@ -195,7 +213,7 @@ def test_a_fork_with_several_trackers(checkout: Path) -> None:
     ("more", "told"),
     [
         ({"checkout": "/nowhere"}, "/nowhere: no such folder"),
-        ({"checkout": "experiments"}, "looked in it for pysot/core/config.py, found none"),
+        ({"checkout": "experiments"}, "looked in it for pysot/core/config.py, found 0"),
         ({"config": "none.yaml"}, r"none\.yaml: no such file"),
         ({"snapshot": "none.pth"}, r"none\.pth: no such file"),
         ({"device": "tpu"}, "it is cpu, cuda or cuda:N"),

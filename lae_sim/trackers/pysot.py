@@ -65,23 +65,35 @@ class PySot:
         self._checkout = existing(checkout, "the checkout of pysot", folder=True)
         self._config = existing(config, "the configuration of the model")
         self._snapshot = existing(snapshot, "the weights of the model")
-        core = _one(sorted(self._checkout.glob("*/core/config*.py")), self._checkout)
-        package = core.parent.parent
+        configs = list(self._checkout.glob("*/core/config*.py"))
+        if len(configs) != 1:
+            raise LaeError(
+                f"{self._checkout}: not a checkout of pysot or of a fork: "
+                f"looked in it for pysot/core/config.py, found {len(configs)} like it"
+            )
+        package = configs[0].parent.parent
         # forks call .cuda() whatever cfg.CUDA says; without one that is to change nothing
         kinds = (self._torch.Tensor, self._torch.nn.Module) if device == "cpu" else ()
         self._no_cuda = [(kind, "cuda", _itself) for kind in kinds]
         vars(np).setdefault("float", float)  # gone in NumPy 1.24
         vars(np).setdefault("int", int)
         with explained(f"{self._checkout}"), stand_ins(_UNUSED), replaced(*self._no_cuda):
-            self._cfg = self._import(core).cfg
-            self._merge_config()
+            self._cfg = self._import(configs[0]).cfg
+            try:
+                self._cfg.merge_from_file(str(self._config))
+            except KeyError as error:
+                raise LaeError(f"{self._config}: this checkout has {error.args[0]}") from error
+            self._cfg.CUDA = device != "cpu"
             build = self._find("model", model, package, ("models/**/model_builder*.py",))
             network = build()
             network.load_state_dict(self._weights(network), strict=False)
             network.eval().to(device)
             patterns = ("tracker/tracker_builder.py", "tracker/*_tracker.py")
             self._tracker = self._find("tracker", tracker, package, patterns)(network)
-        self._mend_opencv_test(package.name)
+        # SiamMask looks for a 4 at a place of the version where 3.x and 4.10 or later have none
+        module: Any = sys.modules.get(f"{package.name}.tracker.siammask_tracker")
+        if module is not None:
+            module.cv2 = SimpleNamespace(**{**vars(module.cv2), "__version__": "4.0.0"})
 
     def init(self, frame: Image, box: Box) -> None:
         """Start on a new sequence."""
@@ -128,13 +140,6 @@ class PySot:
         parts = file.relative_to(self._checkout).with_suffix("").parts
         return import_from(self._checkout, ".".join(parts))
 
-    def _merge_config(self) -> None:
-        try:
-            self._cfg.merge_from_file(str(self._config))
-        except KeyError as error:
-            raise LaeError(f"{self._config}: this checkout has {error.args[0]}") from error
-        self._cfg.CUDA = self._device != "cpu"
-
     def _find(self, option: str, name: str, package: Path, patterns: Sequence[str]) -> Any:
         """The class or function of that name, or the only one, by the first pattern with any."""
         wanted = r"^(?:class|def) (build_tracker|\w+Tracker|ModelBuilder\w*)\b"
@@ -150,22 +155,16 @@ class PySot:
 
     def _weights(self, network: Any) -> dict[str, Any]:
         """The weights of the snapshot, if they are those of the network."""
-        torch = self._torch
-        # training snapshots hold NumPy scalars beside the weights
-        allow = getattr(torch.serialization, "safe_globals", None)
-        with (
-            explained(f"{self._snapshot}: not a snapshot"),
-            allow(_numpy_scalars()) if allow else nullcontext(),
-        ):
-            loaded = torch.load(str(self._snapshot), map_location="cpu", weights_only=True)
+        with explained(f"{self._snapshot}: not a snapshot"), _numpy_scalars_allowed(self._torch):
+            loaded = self._torch.load(str(self._snapshot), map_location="cpu", weights_only=True)
             loaded = loaded.get("state_dict", loaded)
             # DataParallel puts "module." before each name
             weights = {re.sub("^module[.]", "", name): value for name, value in loaded.items()}
-            shapes = {name: tuple(value.shape) for name, value in weights.items()}
-        needed = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-        lacks = [n for n in needed if n not in shapes and not n.endswith("num_batches_tracked")]
+            shapes = {name: value.shape for name, value in weights.items()}
+        needed = {name: value.shape for name, value in network.state_dict().items()}
+        counters = {name for name in needed if name.endswith("num_batches_tracked")}
         faults = {
-            "lacks": lacks,
+            "lacks": [name for name in needed if name not in shapes and name not in counters],
             "also has": [name for name in shapes if name not in needed],
             "has in another shape": [n for n in needed if shapes.get(n, needed[n]) != needed[n]],
         }
@@ -177,30 +176,16 @@ class PySot:
             )
         return weights
 
-    def _mend_opencv_test(self, package: str) -> None:
-        # SiamMask looks for a 4 at a place of the version where 3.x and 4.10 or later have none
-        module: Any = sys.modules.get(f"{package}.tracker.siammask_tracker")
-        if module is not None:
-            module.cv2 = SimpleNamespace(**{**vars(module.cv2), "__version__": "4.0.0"})
-
-
-def _one(configs: Sequence[Path], checkout: Path) -> Path:
-    if len(configs) != 1:
-        found = ", ".join(str(path.relative_to(checkout)) for path in configs) or "none"
-        raise LaeError(
-            f"{checkout}: not a checkout of pysot or a fork: looked in it for "
-            f"pysot/core/config.py, found {found}"
-        )
-    return configs[0]
-
 
 def _itself(value: Any, *args: Any, **kwargs: Any) -> Any:
     return value
 
 
-def _numpy_scalars() -> list[Any]:
-    """What a pickled NumPy number consists of, for NumPy 1's name of it and for NumPy 2's."""
+def _numpy_scalars_allowed(torch: Any) -> Any:
+    """Let snapshots of a training hold NumPy's numbers, such as the epoch, beside the weights."""
+    if [int(part) for part in torch.__version__.split(".")[:2]] < [2, 6]:
+        return nullcontext()
     scalar = np.float64(0).__reduce__()[0]
-    names = [f"numpy.{core}.multiarray.scalar" for core in ("core", "_core")]
+    names = [f"numpy.{core}.multiarray.scalar" for core in ("core", "_core")]  # NumPy 1 and 2
     kinds = [type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8")]
-    return [(scalar, name) for name in names] + [np.dtype, *kinds]
+    return torch.serialization.safe_globals([(scalar, n) for n in names] + [np.dtype, *kinds])
