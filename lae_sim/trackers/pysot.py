@@ -130,10 +130,9 @@ class PySot:
                 "tracker": kind,
                 "backbone": backbone,
                 "device": self._device,
-                "torch_threads": self._torch.get_num_threads(),
             },
             "weights_digest": sha256(self._snapshot),
-            "libraries": {"torch": self._torch.__version__, "cuda": self._torch.version.cuda},
+            "libraries": {"cuda": self._torch.version.cuda},
         }
 
     def _import(self, file: Path) -> Any:

@@ -180,9 +180,9 @@ class PyTracking:
         return {
             "name": f"{settings['tracker']}-{settings['parameter']}",
             "version": commit(self._checkout),
-            "settings": {**settings, "torch_threads": self._torch.get_num_threads()},
+            "settings": dict(settings),
             "weights_digest": sha256(self._network),
-            "libraries": {"torch": self._torch.__version__, "cuda": self._torch.version.cuda},
+            "libraries": {"cuda": self._torch.version.cuda},
         }
 
     def _rgb(self, frame: Image) -> Any:
