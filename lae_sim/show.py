@@ -37,9 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add = parser.add_argument
     add("traces", nargs="+", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")
-    kind = parser.add_mutually_exclusive_group()
-    kind.add_argument("--json", action="store_true", help="print one JSON object instead of text")
-    kind.add_argument("--metadata", action="store_true", help="print the traces' metadata only")
+    add("--json", action="store_true", help="print one JSON object instead of text")
     add("--plot", metavar="FILE", help="draw the times (.png, .svg, .pdf)")
     arguments = parser.parse_args(argv)
     return exit_status(lambda: _show(arguments), "lae-sim show")
@@ -58,24 +56,15 @@ def _show(arguments: argparse.Namespace) -> None:
 
         check_distinct([arguments.plot], arguments.traces)
         check_format(arguments.plot)
-    reports, times = [], []
-    for number, path in enumerate(arguments.traces):
-        trace = read_trace(path)
-        if arguments.metadata:
-            document = trace.metadata.document
-            print(json.dumps(document, indent=2, ensure_ascii=False))
-        if arguments.metadata and not arguments.plot:
-            continue
-        report, sequences = describe(trace, path)
-        reports.append(report)
-        times.append(sequences if arguments.plot else [])
-        if not arguments.json and not arguments.metadata:
-            print("\n" * bool(number) + overview(report))
+    found = [describe(read_trace(path), path) for path in arguments.traces]
+    reports = [report for report, _ in found]
     if arguments.json:
         document = {"format": "lae-show", "version": "1.0", "lae_sim": __version__}
         print(json.dumps({**document, "traces": reports}, indent=2, allow_nan=False))
+    else:
+        print("\n\n".join(map(overview, reports)))
     if arguments.plot:
-        _plot(reports, times, arguments.plot)
+        _plot(found, arguments.plot)
 
 
 def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
@@ -128,11 +117,6 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
             "first_calls": timing.first_calls(sequences),
             "order_known": ordered,
             "drift": timing.drift(sequences),
-            "medians": [
-                {"sequence": s.name, "ms": float(np.median(s.elapsed_ns)) / 1e6}
-                for s in sequences
-                if len(s.elapsed_ns)
-            ],
             "stalls": timing.stalls(sequences),
         },
     }
@@ -150,9 +134,6 @@ def _warnings(report: Report, metadata: Metadata) -> Iterator[str]:
     if drift and drift["slower"]:
         longer = f"took {100 * drift['ratio'] - 100:.0f}% longer than the first third"
         yield f"the last third of the run {longer}: heat, throttling, or harder sequences"
-    if drift and (drift["within"] or 0) > 1.1:
-        longer = f"takes {100 * drift['within'] - 100:.0f}% longer than the first"
-        yield f"calls become slower within sequences: the last third {longer}"
     device = metadata.document.get("device", {})
     taken = device.get("readings", {})
     found = gathered(  # whatever another program wrote there
@@ -172,49 +153,32 @@ def _busy(load: float, cpu: Mapping[str, Any]) -> str | None:
     return f"the load before the profile was {load:.1f} on {cores} cores: other programs were busy"
 
 
-def _plot(reports: Sequence[Report], times: Sequence[Sequence[SequenceTimes]], path: str) -> None:
+def _plot(found: Sequence[tuple[Report, Sequence[SequenceTimes]]], path: str) -> None:
     """Draw, for each trace, a histogram of its times, and the times over the run."""
-    import numpy as np
     from matplotlib.figure import Figure
 
     from lae_sim import plots
 
-    figure = Figure(figsize=(11, 3.6 * len(reports)), layout="constrained")
-    rows = figure.subplots(len(reports), 2, squeeze=False, width_ratios=(1, 2))
-    for (left, right), report, sequences in zip(rows, reports, times):
-        found = report["times"]
-        interval, histogram = found["frame_interval_ms"], found["histogram"]
-        if histogram is None:
-            continue
-        edges = histogram["edges_ms"]
-        left.stairs(histogram["counts"], edges, fill=True, color="C0")
-        uneven = edges[-1] - edges[-2] > 1.5 * (edges[1] - edges[0])
-        left.set(xlabel="time (ms)", ylabel="calls", xscale="log" if uneven else "linear")
-        outside = histogram["below"] + histogram["above"]
-        left.set_title(f"{outside:,} of {found['calls']['n']:,} calls are outside", fontsize=9)
+    figure = Figure(figsize=(11, 3.6 * len(found)), layout="constrained")
+    rows = figure.subplots(len(found), 2, squeeze=False, width_ratios=(1, 2))
+    for (left, right), (report, sequences) in zip(rows, found):
+        times = report["times"]
+        if histogram := times["histogram"]:
+            left.stairs(histogram["counts"], histogram["edges_ms"], fill=True)
+            outside = histogram["below"] + histogram["above"]
+            left.set_title(f"{outside:,} of {times['calls']['n']:,} calls are outside", fontsize=9)
+            calls = times["calls"]
+            right.set_yscale("log" if calls["max_ms"] > 5 * calls["median_ms"] else "linear")
+        left.set(xlabel="time (ms)", ylabel="calls")
         start = 0
         for number, sequence in enumerate(sequences):
-            ms = sequence.elapsed_ns / 1e6
-            places = start + np.arange(len(ms))
-            right.plot(places, ms, ".", ms=1.5, color=f"C{number % 2 * 9}", rasterized=True)
-            if len(ms):
-                label = "median of a sequence" if number == 0 else None
-                ends = [start, start + len(ms)]
-                right.plot(ends, [np.median(ms)] * 2, color="black", lw=1.5, label=label)
-            start += len(ms)
-        calls = found["calls"]
-        right.set_yscale("log" if calls["max_ms"] > 5 * calls["median_ms"] else "linear")
-        order = "as they were run" if found["order_known"] else "in order of their names"
-        right.set(
-            xlabel=f"calls, sequences {order}", ylabel="time (ms)", xlim=(-start / 100, start)
-        )
-        right.axhline(interval, color="tab:red", ls="--", lw=1, label="interval between frames")
-        right.legend(loc="upper right", fontsize=8, framealpha=0.6)
-        right.set_title(report["trace"], fontsize=9)
-        for axes in (left, right):
-            axes.grid(alpha=0.3)
-        if edges[0] < interval < edges[-1]:
-            left.axvline(interval, color="tab:red", ls="--", lw=1)
+            places = range(start, start := start + len(sequence.elapsed_ns))
+            ms, colour = sequence.elapsed_ns / 1e6, f"C{number % 2 * 9}"
+            right.plot(places, ms, ".", ms=1.5, color=colour, rasterized=True)
+        order = "as they were run" if times["order_known"] else "in order of their names"
+        right.set(xlabel=f"calls, sequences {order}", ylabel="time (ms)")
+        right.axhline(times["frame_interval_ms"], color="tab:red", ls="--", lw=1)
+        right.set_title(f"{report['trace']} (dashed: the interval between frames)", fontsize=9)
     plots.save(figure, path)
 
 

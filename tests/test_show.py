@@ -6,13 +6,14 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lae_sim import show
@@ -29,18 +30,17 @@ MS = 10**6
 MHZ = {"lowest": 400.0, "allowed": 1728.0}
 
 
-def run(*arguments: Any, status: int = 0, **environment: str) -> str:
-    command = [sys.executable, "-W", "error", "-m", "lae_sim.show", *map(str, arguments)]
-    done = subprocess.run(
-        command,
-        capture_output=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8", **environment},
-        timeout=60,
-    )
-    out, error = done.stdout.decode(), done.stderr.decode()
-    assert done.returncode == status, error
-    assert "Traceback" not in error
-    return error if status else out
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run the command; what it prints, or its error."""
+
+    def command(*arguments: Any, status: int = 0) -> str:
+        assert show.main([str(argument) for argument in arguments]) == status
+        said = capsys.readouterr()
+        assert said.err.count("\n") == bool(status)
+        return said.err if status else said.out
+
+    return command
 
 
 def reading(mhz: float, celsius: float, **more: Any) -> dict[str, Any]:
@@ -114,20 +114,22 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_everything_that_a_profile_says_is_shown(full: Path) -> None:
+def test_everything_that_a_profile_says_is_shown(
+    run: Callable[..., str], full: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
     lines = run(full).splitlines()
     text = " ".join(" ".join(lines).split())
     for words in (
-        "tracker nanotrack 2, weights digest sha256:0123456789ab...",
+        "tracker nanotrack, version 2, weights digest sha256:0123456789ab...",
         "settings not half, instance size 255",
         "libraries opencv 5.0.0",
-        "device NVIDIA Jetson Orin Nano, memory 8.0 GiB",
-        "power mode 15W (nvpmodel 0)",
+        "device NVIDIA Jetson Orin Nano, memory 8.0 GiB, power mode 15W (nvpmodel 0)",
         "cpu Cortex-A78AE, cores 6",
         "timing measured, clock perf_counter_ns, cpu share 1.87, synchronised, threads 2, warmup",
         "schedule every-frame, stride 1",
         "dataset DTB70",
-        "lae sim 0.2.0, commit abababababab..., modified",
+        "lae sim commit abababababab..., modified, version 0.2.0",
         "2,000 in 20 sequences at 30 fps; all processed; 1,980 truths; 640x360 px; target not "
         "found in 40",
         "failures 1: reason ValueError: no, sequence s20",
@@ -143,34 +145,29 @@ def test_everything_that_a_profile_says_is_shown(full: Path) -> None:
         "warning the first call after an initialisation takes 90 ms, 15 x the median of the "
         "others: warm up",
         "longer than the first third: heat, throttling, or harder sequences",
-        "throttling: oc3 rose by 19; the CPU's clock fell from 1,700 to 1,420 MHz",
+        "throttling: oc3 rose by 19; the CPU's highest clock fell from 1,700 to 1,440 MHz",
     ):
         assert words in text, words
     assert "medians of tenths of the run, ms" in lines  # whose order is known
     assert max(map(len, lines)) <= 96
-    assert max(map(len, run(full, COLUMNS="80").splitlines()[1:])) <= 80
+    monkeypatch.setenv("COLUMNS", "80")
+    assert max(map(len, run(full).splitlines()[1:])) <= 80
     assert len(lines) < 75
 
 
-def test_bars_are_as_long_as_their_counts(full: Path) -> None:
+def test_bars_are_as_long_as_their_counts(run: Callable[..., str], full: Path) -> None:
     lines = run(full).splitlines()
     start = next(i for i, line in enumerate(lines) if line.split() == ["ms", "calls"])
     rows = lines[start + 1 : lines.index("", start)]
     counts = [int(row[10:21].replace(",", "")) for row in rows]
     assert sum(counts) == 1980
-    bars = [row.count("█") for row in rows]
+    bars = [row.count("#") for row in rows]
     assert max(bars) == 50
     for count, bar in zip(counts, bars):
         assert bar == pytest.approx(50 * count / max(counts), abs=1)
 
 
-def test_a_terminal_without_blocks_gets_signs(full: Path) -> None:
-    text = run(full, PYTHONIOENCODING="ascii")
-    assert "#" * 50 in text
-    assert "?" not in text
-
-
-def test_little_is_said_where_little_is_known(tmp_path: Path) -> None:
+def test_little_is_said_where_little_is_known(run: Callable[..., str], tmp_path: Path) -> None:
     path = tmp_path / "constant.parquet"
     box = np.tile([1.0, 2, 3, 4], (200, 1))
     recording = Recording.new("a", box, box, np.full(200, 47 * MS))
@@ -183,14 +180,14 @@ def test_little_is_said_where_little_is_known(tmp_path: Path) -> None:
     assert "100% of the calls" in text
 
 
-def test_one_frame_is_a_trace_too(tmp_path: Path) -> None:
+def test_one_frame_is_a_trace_too(run: Callable[..., str], tmp_path: Path) -> None:
     path = tmp_path / "one.parquet"
     recording = Recording.new("a", [[1, 2, 3, 4]], [[1, 2, 3, 4]], [5 * MS])
     write_trace(Trace(Metadata.new("30", "every-frame"), [recording]), path)
-    assert "initialisations" in run(path, "--plot", tmp_path / "one.svg")
+    assert "initialisations" in run(path)
 
 
-def test_samples_are_shown_one_after_the_other() -> None:
+def test_samples_are_shown_one_after_the_other(run: Callable[..., str]) -> None:
     text = run(SLOW, REAL_TIME)
     assert "warning      the first call after an initialisation takes 102 ms, 2.2 x" in text
     assert "timing       synthetic (made up, not measured)" in text
@@ -199,7 +196,7 @@ def test_samples_are_shown_one_after_the_other() -> None:
     assert "(sequences by name: their order is unknown)" in text
 
 
-def test_json_has_the_same(full: Path) -> None:
+def test_json_has_the_same(run: Callable[..., str], full: Path) -> None:
     document = json.loads(run(full, SLOW, "--json"))
     assert (document["format"], document["version"]) == ("lae-show", "1.0")
     first, second = document["traces"]
@@ -210,15 +207,10 @@ def test_json_has_the_same(full: Path) -> None:
     times = first["times"]
     assert times["calls"]["n"] == 1980
     assert times["initialisations"]["mean_ms"] == 300
-    assert [one["sequence"] for one in times["medians"]][:2] == ["s19", "s18"]  # as they were run
     assert times["drift"]["slower"] is True
     assert times["stalls"][0] == {"sequence": "s04", "frame": 77, "ms": 812.0, "first_call": False}
     assert len(first["warnings"]) == 3
     assert (second["lost"], second["times"]["order_known"]) == (None, False)
-
-
-def test_metadata_is_printed_whole(full: Path) -> None:
-    assert json.loads(run(full, "--metadata")) == profiled()[0].document
 
 
 def test_what_the_profiler_writes_fits_the_schema() -> None:
@@ -234,7 +226,7 @@ def test_what_the_profiler_writes_fits_the_schema() -> None:
         jsonschema.validate(wrong, schema)
 
 
-def test_pictures(full: Path, tmp_path: Path) -> None:
+def test_pictures(run: Callable[..., str], full: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="pictures need it")
     run(full, SLOW, "--plot", tmp_path / "times.svg")
     picture = (tmp_path / "times.svg").read_text()
@@ -243,13 +235,15 @@ def test_pictures(full: Path, tmp_path: Path) -> None:
     assert "would replace" in run(full, "--plot", full, status=2)
 
 
-def test_faults_are_one_line(tmp_path: Path) -> None:
+def test_faults_are_one_line(run: Callable[..., str], tmp_path: Path) -> None:
     assert "no such file" in run(tmp_path / "none.parquet", status=2)
     (tmp_path / "text.parquet").write_text("no")
     assert "not a readable Parquet file" in run(tmp_path / "text.parquet", status=2)
 
 
-def test_control_characters_do_not_reach_the_terminal(tmp_path: Path) -> None:
+def test_control_characters_do_not_reach_the_terminal(
+    run: Callable[..., str], tmp_path: Path
+) -> None:
     path = tmp_path / "odd.parquet"
     metadata = Metadata.new("30", "every-frame", tracker={"name": "\x1b[2Jred\n\ud800"}, mine="\a")
     write_trace(Trace(metadata, profiled()[1]), path)
@@ -298,6 +292,7 @@ def test_odd_figures_are_shown() -> None:
     assert "cpu        A; 2" in text
 
 
+@settings(max_examples=30)
 @given(
     st.fixed_dictionaries(
         {},
@@ -326,7 +321,7 @@ def test_any_metadata_is_shown(more: dict[str, Any]) -> None:
     assert not any(ord(c) < 32 for c in text.replace("\n", ""))
 
 
-def test_real_stalls_are_found(shared_data: Path, tmp_path: Path) -> None:
+def test_real_stalls_are_found(run: Callable[..., str], shared_data: Path, tmp_path: Path) -> None:
     name = "VisDrone-SOT-test-dev"
     results = shared_data / "results_with_times" / name / "ORTrack-DeiT-tiny"
     command = [sys.executable, "-m", "lae_sim.convert", results, "--truth", shared_data / name]
