@@ -6,20 +6,14 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli import argument, exit_status
-from lae_sim.clock import parse_fps, parse_rational
+from lae_sim.cli import exit_status
 from lae_sim.errors import LaeError
 from lae_sim.options import add_world, load_forecaster, parse_latency, parse_policy
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from lae_sim.evaluation import Answers
     from lae_sim.forecast import ForecasterFactory
     from lae_sim.frames import Image, ImageSequence
@@ -27,15 +21,13 @@ if TYPE_CHECKING:
     from lae_sim.run import Run
 
 PROGRAM = "lae-sim render"
-FILMS = {".mp4": "mp4v", ".avi": "MJPG"}
-SHEETS = (".png", ".jpg", ".jpeg")
 
 EXAMPLES = """\
 examples:
   lae-sim render trace.parquet --sequence race --out race.mp4         a trace of synthetic sequences
-  lae-sim render trace.parquet --root ~/data/DTB70 --sequence Gull2 --out gull.mp4 --speed 1/4
+  lae-sim render trace.parquet --root ~/data/DTB70 --sequence Gull2 --out gull.mp4
   lae-sim render trace.parquet --root ~/data/DTB70 --latency constant:100ms --out films/
-  lae-sim render trace.parquet --root ~/data/DTB70 --sequence Gull2 --out gull.png --crop
+  lae-sim render trace.parquet --root ~/data/DTB70 --sequence Gull2 --out gull.png
   lae-sim render trace.parquet --root clip.mp4 --out sheet.jpg --frames 0 30 60 --forecaster kalman
 
 White is the ground truth. The other boxes are what is known when the frame is queried: hold is the
@@ -51,13 +43,11 @@ class Scene:
         run: the replayed sequence.
         images: the same sequence's frames.
         answers: what each forecaster answers for every world frame, by name.
-        crop: show the part of the frames around the target only.
     """
 
     run: Run
     images: ImageSequence
     answers: Mapping[str, Answers]
-    crop: bool = False
 
     @classmethod
     def of(
@@ -66,9 +56,7 @@ class Scene:
         images: ImageSequence,
         metadata: Metadata,
         forecasters: Mapping[str, ForecasterFactory],
-        sigma: Fraction = Fraction(0),
         at_arrival: bool = False,
-        crop: bool = False,
     ) -> Scene:
         """The scene of a run and what forecasters make of it (see `lae_sim.evaluation.answers`).
 
@@ -83,10 +71,10 @@ class Scene:
                 f"{len(images)} images: is this the dataset that it was recorded on?"
             )
         found = {
-            name: answers(run, metadata, name, factory, sigma, at_arrival)
+            name: answers(run, metadata, name, factory, at_arrival=at_arrival)
             for name, factory in forecasters.items()
         }
-        return cls(run, images, found, crop)
+        return cls(run, images, found)
 
     def draw(self, frame: int, width: int | None = None) -> Image:
         """Draw the boxes for a world frame on it; see `lae_sim.drawing.draw_frame`.
@@ -99,42 +87,19 @@ class Scene:
         last = len(self.run) - 1
         if not 0 <= frame <= last:
             raise LaeError(f"sequence {self.run.recording.name!r} has frames 0 to {last}")
-        image = self.images.read(frame)
-        left, top, right, bottom = self._windows[frame] if self.crop else (0, 0, None, None)
-        offset = [left, top, 0, 0]
         source = next(iter(self.answers.values())).source_frame[frame]
-        milliseconds = self.run.schedule.clock.milliseconds
         caption = (
             self.run.recording.name,
-            _padded("frame {} of {}", frame, last + 1),
-            _padded("{:.3f} s", milliseconds(frame) / 1000, longest=milliseconds(last) / 1000),
-            _padded("output of frame {}, {} before", source, frame - source, longest=last),
+            f"frame {frame} of {last + 1}",
+            f"{self.run.schedule.clock.milliseconds(frame) / 1000:.3f} s",
+            f"output of frame {source}, {frame - source} before",
         )
-        boxes = {name: found.boxes[frame] - offset for name, found in self.answers.items()}
-        truth = self.run.recording.truth[frame] - offset
-        return draw_frame(image[top:bottom, left:right], boxes, truth, caption, width)
+        boxes = {name: found.boxes[frame] for name, found in self.answers.items()}
+        truth = self.run.recording.truth[frame]
+        return draw_frame(self.images.read(frame), boxes, truth, caption, width)
 
-    @property
-    def fps(self) -> Fraction:
-        """World frames per second."""
-        return self.run.schedule.clock.fps
-
-    @cached_property
-    def _windows(self) -> npt.NDArray[np.int64]:
-        import numpy as np
-
-        from lae_sim.drawing import follow
-
-        height, width = self.images.read(0).shape[:2]
-        boxes = [self.run.recording.truth, *(found.boxes for found in self.answers.values())]
-        return follow(np.stack(boxes, axis=1), (width, height))
-
-    def film(self, path: str | Path, fps: Fraction | None = None) -> None:
-        """Write a film of all frames, whole or not at all, with a progress bar on a terminal.
-
-        Args:
-            path: an .mp4 (MPEG-4) or .avi (Motion JPEG) file.
-            fps: frames per second of the film; by default the world's.
+    def film(self, path: str | Path) -> None:
+        """Write an MP4 of all frames, whole or not at all, with a progress bar on a terminal.
 
         Raises:
             LaeError: if it cannot be written, or a frame cannot be read.
@@ -145,17 +110,13 @@ class Scene:
 
         from lae_sim.files import written_whole
 
-        codec = FILMS[Path(path).suffix.lower()]
-        rate = float(fps or self.fps)
         first = self.draw(0)
         fill = [(0, side % 2) for side in first.shape[:2]] + [(0, 0)]  # codecs need even sides
         height, width = np.pad(first, fill).shape[:2]
+        fourcc, rate = cv2.VideoWriter.fourcc(*"mp4v"), float(self.run.schedule.clock.fps)
         with written_whole(path) as temporary:
-            fourcc = cv2.VideoWriter.fourcc(*codec)
             writer = cv2.VideoWriter(str(temporary), fourcc, rate, (width, height))
             try:
-                if not writer.isOpened():
-                    raise LaeError(f"{path}: this OpenCV cannot write {codec} films")
                 for frame in trange(len(self.run), desc=Path(path).name, disable=None):
                     picture = self.draw(frame)
                     if picture.shape != first.shape:
@@ -164,7 +125,7 @@ class Scene:
             finally:
                 writer.release()
             written = cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)
-            if written != len(self.run):  # the writer does not say when the disk is full
+            if written != len(self.run):  # the writer is silent on a full disk, or without a codec
                 raise LaeError(f"{path}: only {written:.0f} of {len(self.run)} frames were written")
 
     def strip(self, frames: Sequence[int], width: int = 640) -> Image:
@@ -172,12 +133,6 @@ class Scene:
         from lae_sim.drawing import film_strip
 
         return film_strip([self.draw(frame, width) for frame in frames])
-
-
-def _padded(words: str, *values: float, longest: float | None = None) -> str:
-    """Words that are as long in every frame."""
-    most = max(values) if longest is None else longest
-    return words.format(*values).ljust(len(words.format(*[most] * len(values))))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -194,8 +149,7 @@ def parser() -> argparse.ArgumentParser:
         "--out",
         required=True,
         metavar="FILE",
-        help="a film (.mp4, .avi), a contact sheet (.png, .jpg), or a folder for a film of each "
-        "sequence",
+        help="a film (.mp4), a contact sheet (.png, .jpg), or a folder for a film of each sequence",
     )
     group = made.add_argument_group("the frames")
     add = group.add_argument
@@ -213,25 +167,8 @@ def parser() -> argparse.ArgumentParser:
         help="forecasters to draw, named as for lae-sim replay (default: hold kalman)",
     )
     add(
-        "--sigma",
-        type=argument(parse_rational),
-        default=Fraction(0),
-        metavar="FRAMES",
-        help="permitted latency (default: 0)",
+        "--frames", nargs="+", type=int, metavar="N", help="of a contact sheet (default: 12 of all)"
     )
-    add("--crop", action="store_true", help="follow the target closely")
-    add(
-        "--speed",
-        type=argument(parse_fps),
-        default=Fraction(1),
-        metavar="FACTOR",
-        help="of a film: 1/4 is slow motion (default: 1)",
-    )
-    sheet = group.add_mutually_exclusive_group()
-    sheet.add_argument(
-        "--count", type=int, default=12, metavar="N", help="frames of a contact sheet (default: 12)"
-    )
-    sheet.add_argument("--frames", nargs="+", type=int, metavar="N", help="these frames instead")
     return made
 
 
@@ -248,10 +185,8 @@ def _render(arguments: argparse.Namespace) -> None:
     out = Path(arguments.out)
     kind = out.suffix.lower()
     folder = out.is_dir() or not kind
-    if not folder and kind not in (*FILMS, *SHEETS):
-        raise LaeError(f"--out {out}: name a .mp4, .avi, .png or .jpg file, or a folder")
-    if arguments.count < 1:
-        raise LaeError("--count needs at least one frame")
+    if not folder and kind not in (".mp4", ".png", ".jpg", ".jpeg"):
+        raise LaeError(f"--out {out}: name a .mp4, .png or .jpg file, or a folder")
     check_distinct([out], [path for path in inputs if path])
     metadata, runs, at_arrival = _replayed(arguments)
     if not folder and len(runs) > 1:
@@ -262,17 +197,16 @@ def _render(arguments: argparse.Namespace) -> None:
     forecasters = {name: load_forecaster(name) for name in arguments.forecaster}
     for run in runs:
         images = _images(run, metadata, arguments)
-        scene = Scene.of(
-            run, images, metadata, forecasters, arguments.sigma, at_arrival, arguments.crop
-        )
+        scene = Scene.of(run, images, metadata, forecasters, at_arrival)
         if folder:
             out.mkdir(parents=True, exist_ok=True)
             name = run.recording.name.replace("/", "-")
-            scene.film(out / f"{name}.mp4", scene.fps * arguments.speed)
-        elif kind in FILMS:
-            scene.film(out, scene.fps * arguments.speed)
+            scene.film(out / f"{name}.mp4")
+        elif kind == ".mp4":
+            scene.film(out)
         else:
-            _sheet(scene, arguments.frames or _spread(len(run), arguments.count), out)
+            last = len(run) - 1
+            _sheet(scene, arguments.frames or sorted({last * k // 11 for k in range(12)}), out)
 
 
 def _replayed(arguments: argparse.Namespace) -> tuple[Metadata, list[Run], bool]:
@@ -282,8 +216,6 @@ def _replayed(arguments: argparse.Namespace) -> tuple[Metadata, list[Run], bool]
     from lae_sim.trace import read_trace
 
     policy, at_arrival = parse_policy(arguments.policy)
-    if at_arrival and arguments.sigma:
-        raise LaeError("vot-realtime never scores latency: it goes with no permitted latency")
     source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
     trace = read_trace(arguments.trace, arguments.sequence)
     timing = read_trace(arguments.timing) if arguments.timing else None
@@ -305,22 +237,12 @@ def _images(run: Run, metadata: Metadata, arguments: argparse.Namespace) -> Imag
     return find_dataset(name, root, sequences, box).sequences[0]
 
 
-def _spread(length: int, count: int) -> list[int]:
-    """At most ``count`` frames, evenly spaced from the first to the last."""
-    count = min(count, length)
-    return [round(k * (length - 1) / max(count - 1, 1)) for k in range(count)]
-
-
 def _sheet(scene: Scene, frames: Sequence[int], path: Path) -> None:
     import cv2
 
     from lae_sim.files import written_whole
 
-    strip = scene.strip(frames)
-    try:
-        _, encoded = cv2.imencode(path.suffix.lower(), strip)
-    except cv2.error as error:
-        raise LaeError(f"{path}: {len(frames)} frames are too many for one picture") from error
+    _, encoded = cv2.imencode(path.suffix.lower(), scene.strip(frames))
     with written_whole(path) as temporary:
         temporary.write_bytes(encoded.tobytes())
 

@@ -113,7 +113,7 @@ def _readings(device: Any) -> list[str]:
 
 def _range(taken: Any, figure: Callable[[Any], float]) -> str:
     """The lowest and highest value of a figure in one reading or several."""
-    values = []
+    values: list[float] = []
     for one in taken if isinstance(taken, list) else [taken]:
         values += gathered(value=lambda one=one: float(figure(one))).values()  # type: ignore[misc]
     return " to ".join(dict.fromkeys(map(_figure, [min(values), max(values)]))) if values else ""

@@ -9,7 +9,7 @@ pytest.importorskip("cv2", reason="drawing needs OpenCV")
 
 import cv2
 
-from lae_sim.drawing import COLOURS, WHITE, draw_frame, film_strip, follow
+from lae_sim.drawing import COLOURS, WHITE, draw_frame, film_strip
 from lae_sim.errors import LaeError
 
 NONE = [np.nan] * 4
@@ -78,7 +78,7 @@ def test_what_is_unknown_is_not_drawn(texts: list[str]) -> None:
     assert (picture[:360] == 90).all()
     far = draw_frame(grey(), {"hold": (1e12, -1e12, 5, 5)}, (10, 10, 10, 10))
     assert far.shape == picture.shape
-    assert texts == ["truth", "hold IoU  -  ", "truth", "hold IoU 0.00"]
+    assert texts == ["truth", "hold IoU -", "truth", "hold IoU 0.00"]
 
 
 def test_captions_say_the_overlap(texts: list[str]) -> None:
@@ -90,24 +90,11 @@ def test_captions_say_the_overlap(texts: list[str]) -> None:
     assert texts == ["hold", "kalman"]
 
 
-def test_a_picture_has_one_size_whatever_its_numbers() -> None:
-    sizes = {
-        draw_frame(grey(), {"hold": box}, truth, [f"{number} " * 6, "x" * length]).shape
-        for number in ("000", "111", "999")
-        for box, truth in [((0, 0, 9, 9), NONE), ((0, 0, 9, 9), (0, 0, 9, 9))]
-        for length in (20,)
-    }
-    assert len(sizes) == 1
-
-
-def test_long_captions_wrap_and_shrink_to_the_width() -> None:
-    short = draw_frame(grey(), {"hold": NONE}, None, ["a"])
-    wrapped = draw_frame(grey(), {"hold": NONE}, None, ["a long word"] * 12)
-    assert wrapped.shape[0] > short.shape[0]
+def test_long_captions_shrink_to_the_width() -> None:
     for words in (["a long word"] * 12, ["w" * 300]):
         band = draw_frame(grey(), {"hold": NONE}, None, words)[360:]
         assert (band[:, -4:] == band[0, 0]).all()  # nothing is cut off at the right
-        assert (band > 200).any()
+        assert (band > 100).any()
 
 
 def test_a_film_strip_is_a_grid() -> None:
@@ -125,32 +112,3 @@ def test_a_film_strip_is_a_grid() -> None:
         film_strip([pictures[0], pictures[1][1:]])
     with pytest.raises(LaeError, match="at least one"):
         film_strip([])
-
-
-def test_windows_follow_the_target() -> None:
-    t = np.arange(100.0)
-    truth = np.stack([100 + 9 * t, 300 + 2 * t, np.full(100, 30), np.full(100, 20)], axis=1)
-    behind = np.concatenate([truth[:1], truth[:-1]])
-    windows = follow(np.stack([truth, behind], axis=1), (1280, 720))
-    sides = windows[:, 2:] - windows[:, :2]
-    assert (sides == sides[0]).all()
-    assert sides[0, 0] / sides[0, 1] == pytest.approx(16 / 9, rel=0.02)
-    assert sides[0, 0] < 200
-    for boxes in (truth, behind):
-        assert (windows[:, :2] <= boxes[:, :2]).all()
-        assert (boxes[:, :2] + boxes[:, 2:] <= windows[:, 2:]).all()
-    assert windows.min() >= 0
-    assert (windows[:, 2:] <= (1280, 720)).all()
-    lost = np.tile([5.0, 5, 30, 20], (100, 1))
-    lost[:5] = truth[:5]
-    with_lost = follow(np.stack([truth, behind, lost], axis=1), (1280, 720))
-    assert (with_lost[:, 2:] - with_lost[:, :2] <= 1.6 * sides).all()
-
-
-def test_windows_where_the_truth_is_not_known() -> None:
-    truth = np.array([[100.0, 50, 10, 10], NONE, [120, 50, 10, 10]])
-    windows = follow(np.stack([truth, truth[[0, 0, 2]]], axis=1), (400, 300))
-    middle = (windows[:, :2] + windows[:, 2:]) / 2
-    assert middle[:, 0] == pytest.approx([105, 115, 125], abs=1)
-    nothing = follow(np.full((4, 2, 4), np.nan), (400, 300))
-    assert nothing.tolist() == [[0, 0, 400, 300]] * 4

@@ -109,12 +109,11 @@ def test_frames_that_do_not_exist(scene: Scene) -> None:
             scene.draw(frame)
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".avi"])
-def test_a_film_has_every_frame(scene: Scene, tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / ("film" + suffix)
-    scene.film(path, Fraction(15, 2))
+def test_a_film_has_every_frame(scene: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    scene.film(path)
     assert list(tmp_path.iterdir()) == [path]
-    assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS) == pytest.approx(7.5)
+    assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS) == pytest.approx(30)
     frames = frames_of(path)
     assert len(frames) == T
     assert all(side % 2 == 0 for side in frames[0].shape[:2])
@@ -139,9 +138,7 @@ def test_a_film_appears_whole_or_not_at_all(scene: Scene, tmp_path: Path) -> Non
         assert not list(tmp_path.iterdir())
 
 
-def test_what_opencv_cannot_write(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Full:
         """A disk that is full after some frames."""
 
@@ -154,33 +151,12 @@ def test_what_opencv_cannot_write(
             if self.left >= 0:
                 self.real.write(picture)
 
-    class Missing(Full):
-        def __init__(self, *arguments: object) -> None:
-            super().__init__(*arguments)
-            self.isOpened = lambda: False
-
     real = cv2.VideoWriter
-    for writer, message in [(Full, "only 5 of 20 frames"), (Missing, "cannot write mp4v")]:
-        writer.fourcc = real.fourcc  # type: ignore[attr-defined]
-        monkeypatch.setattr(cv2, "VideoWriter", writer)
-        with pytest.raises(LaeError, match=message):
-            scene.film(tmp_path / "film.mp4")
-        assert not list(tmp_path.iterdir())
-
-
-def test_crop_shows_the_target_larger(every_frame: Metadata) -> None:
-    run = replay_sequence(recording("ball"), Clock.at(Fraction(30)))
-    images = ImageSequence("ball", TRUTH, read)
-    near = Scene.of(run, images, every_frame, {"hold": Hold}, crop=True)
-    far = Scene.of(run, images, every_frame, {"hold": Hold})
-
-    def white(scene: Scene) -> int:
-        columns = (scene.draw(10)[:250] == 255).all(axis=2).any(axis=0).nonzero()[0]
-        return int(columns.max() - columns.min())
-
-    assert white(far) == pytest.approx(52, abs=3)
-    assert white(near) > 1.4 * white(far)
-    assert len({near.draw(frame).shape for frame in range(T)}) == 1
+    Full.fourcc = real.fourcc  # type: ignore[attr-defined]
+    monkeypatch.setattr(cv2, "VideoWriter", Full)
+    with pytest.raises(LaeError, match="only 5 of 20 frames"):
+        scene.film(tmp_path / "film.mp4")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_contact_sheet(run: Callable[..., str], dataset: Path) -> None:
@@ -189,21 +165,8 @@ def test_a_contact_sheet(run: Callable[..., str], dataset: Path) -> None:
     assert sheet.shape[1] == 2 * 640 + 4
     assert has(sheet, 110 * 640 / 641, ORANGE)
     assert has(sheet[:, 644:], 130 * 640 / 641, ORANGE)
-    assert not run("sheet.jpg", "--sequence", "ball", "--count", "3")
-    assert cv2.imread(str(dataset / "sheet.jpg")).shape[1] == 2 * 640 + 4
-
-
-@pytest.mark.parametrize(
-    ("length", "count", "frames"),
-    [(20, 12, 12), (20, 1, 1), (3, 12, 3), (1, 4, 1), (101, 5, [0, 25, 50, 75, 100])],
-)
-def test_spread(length: int, count: int, frames: int | list[int]) -> None:
-    found = render._spread(length, count)
-    assert len(set(found)) == len(found) == (frames if isinstance(frames, int) else len(frames))
-    assert found[0] == 0
-    assert found[-1] == (length - 1 if count > 1 else 0)
-    if not isinstance(frames, int):
-        assert found == frames
+    assert not run("sheet.jpg", "--sequence", "ball")
+    assert cv2.imread(str(dataset / "sheet.jpg")).shape[1] == 4 * 640 + 12
 
 
 def test_options_of_the_world_count(run: Callable[..., str], dataset: Path) -> None:
@@ -213,7 +176,6 @@ def test_options_of_the_world_count(run: Callable[..., str], dataset: Path) -> N
         (["--latency-scale", "1/47"], 4),
         (["--latency", "constant:100ms"], 0),
         (["--policy", "vot-realtime"], 5),
-        (["--sigma", "1"], 4),
         (["--fps", "10"], 4),
     ]:
         assert not run("sheet.png", *ball, *options)
@@ -223,10 +185,10 @@ def test_options_of_the_world_count(run: Callable[..., str], dataset: Path) -> N
 
 
 def test_a_folder_gets_a_film_of_each_sequence(run: Callable[..., str], dataset: Path) -> None:
-    assert not run("films", "--speed", "1/2")
+    assert not run("films")
     films = sorted((dataset / "films").iterdir())
     assert [film.name for film in films] == ["ball.mp4", "car.mp4"]
-    assert cv2.VideoCapture(str(films[0])).get(cv2.CAP_PROP_FPS) == 15
+    assert cv2.VideoCapture(str(films[0])).get(cv2.CAP_PROP_FPS) == 30
     assert len(frames_of(films[1])) == T
 
 
@@ -234,13 +196,11 @@ def test_a_folder_gets_a_film_of_each_sequence(run: Callable[..., str], dataset:
     ("out", "options", "message"),
     [
         ("film.mp4", [], "has 2 sequences: choose one with --sequence, or give a folder"),
-        ("film.mkv", [], "name a .mp4, .avi, .png or .jpg file, or a folder"),
+        ("film.mkv", [], "name a .mp4, .png or .jpg file, or a folder"),
         ("film.mp4", ["--sequence", "bird"], "no sequence 'bird'"),
         ("a.png", ["--sequence", "car", "--frames", "20"], "'car' has frames 0 to 19"),
-        ("a.png", ["--sequence", "car", "--count", "0"], "--count needs at least one frame"),
-        ("a.png", ["--policy", "vot-realtime", "--sigma", "1"], "vot-realtime never scores"),
         ("a.png", ["--forecaster", "nonsense", "--sequence", "car"], "no forecaster 'nonsense'"),
-        ("no/such/folder/a.png", ["--sequence", "car", "--count", "1"], "cannot write"),
+        ("no/such/folder/a.png", ["--sequence", "car"], "cannot write"),
         ("no/such/folder/a.mp4", ["--sequence", "car"], "cannot write"),
     ],
 )
@@ -285,7 +245,12 @@ def test_a_video_without_ground_truth(tmp_path: Path, capsys: pytest.CaptureFixt
         == 0
     )
     assert has(cv2.imread(str(tmp_path / "a.png")), 130, ORANGE)
-    assert render.main([*arguments, str(video)]) == 2
+    assert (
+        render.main(
+            [*arguments[:2], str(tmp_path / "b.png"), *arguments[3:], str(tmp_path / "b.png")]
+        )
+        == 2
+    )
     assert "would replace a file that is read" in capsys.readouterr().err
 
 
@@ -298,7 +263,9 @@ def test_a_synthetic_trace_needs_no_folder(tmp_path: Path) -> None:
     write_trace(Trace(metadata, [made]), tmp_path / "trace.parquet")
     out = tmp_path / "a.png"
     assert (
-        cli.main(["render", str(tmp_path / "trace.parquet"), "--out", str(out), "--count", "2"])
+        cli.main(
+            ["render", str(tmp_path / "trace.parquet"), "--out", str(out), "--frames", "0", "9"]
+        )
         == 0
     )
     assert cv2.imread(str(out)).shape[1] == 2 * 640 + 4
@@ -324,7 +291,7 @@ def test_real_frames(shared_data: Path, tmp_path: Path) -> None:
     root = str(shared_data / "frames" / "DTB70")
     out = tmp_path / "a.png"
     arguments = [str(tmp_path / "trace.parquet"), "--root", root, "--out", str(out)]
-    assert render.main([*arguments, "--frames", "21", "30", "--crop"]) == 0
+    assert render.main([*arguments, "--frames", "21", "30"]) == 0
     sheet = cv2.imread(str(out))
     for colour in (*COLOURS[:2], WHITE):
-        assert (sheet == colour).all(axis=2).sum() > 500
+        assert (sheet == colour).all(axis=2).sum() > 100
