@@ -230,6 +230,8 @@ def _tracker(arguments: argparse.Namespace) -> TimedTracker:
     from lae_sim.translation import Translated
     from lae_sim.worker import InProcess, Worker
 
+    if arguments.translate and arguments.pre_forecaster is None:
+        raise LaeError("--translate shifts frames to where a --pre-forecaster predicts the target")
     options = parse_options(dict(arguments.option))
     if arguments.device is not None:
         options["device"] = arguments.device
@@ -246,8 +248,6 @@ def _tracker(arguments: argparse.Namespace) -> TimedTracker:
             threads=arguments.threads,
             timeout=arguments.frame_timeout / NS_PER_SECOND,
         )
-    if arguments.translate and arguments.pre_forecaster is None:
-        raise LaeError("--translate shifts frames to where a --pre-forecaster predicts the target")
     needed = arguments.pre_forecaster is not None and not tracker.sets_search
     return Translated(tracker) if arguments.translate or needed else tracker
 

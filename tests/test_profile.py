@@ -370,6 +370,17 @@ def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     assert "strided" in out
+    passes = ("--strided", "t.stride2.parquet", "t.stride3.parquet")
+    slow = ("--latency", "constant:47ms", "--json", "--per-sequence")
+    process = start(here, "t.parquet", *passes, *slow, module="replay")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    (report,) = json.loads(out)["traces"]
+    assert report["strided"] == list(passes[1:])
+    # this tracker answers alike in all passes, so each output follows the one it followed there
+    for row in report["results"][0]["per_sequence"]:
+        assert row["disagreement"] == row["approximate_outputs"] == 0
+    assert report["exact"]
     profile(here, *options[:-1], "u.parquet", "--option", "reach=9")
     process = start(here, "u.parquet", *arguments[1:], module="fidelity")
     _, err = process.communicate(timeout=120)
