@@ -31,17 +31,45 @@ SERVE = Path(__file__).with_name("trackers") / "serve.py"
 GLANCE_S = 0.25
 """How often a process at work is looked at, in seconds."""
 
-
 LAST_WORDS = 10_000
 """How many bytes of what a process printed are kept, to say why it crashed."""
 
 CLOSE_S = 2.0
 """How long a tracker may take to close, and its process to exit, in seconds."""
 
-_FIRST_FRAME = re.compile(r"most recent call first\):\n\s*(File .*)")
+
+class _Asked(contextlib.AbstractContextManager[Any]):
+    """The methods of a `lae_sim.timed.TimedTracker`, whose questions ``_ask`` answers."""
+
+    sets_search = False
+
+    def init(self, frame: Image, box: Sequence[float]) -> Answer:
+        """Start on a new sequence."""
+        return _answer(self._ask("init", frame=_checked(frame), box=_four(box)))
+
+    def track(self, frame: Image, search: Sequence[float] | None = None) -> Answer:
+        """Find the target, around ``cx, cy, w, h`` if ``search`` is given."""
+        where = None if search is None else _four(search)
+        return _answer(self._ask("track", frame=_checked(frame), search=where))
+
+    def describe(self) -> Mapping[str, Any]:
+        """What the tracker says of itself, and the interpreter and libraries it runs on."""
+        found: Mapping[str, Any] = self._ask("describe")
+        return found
+
+    def close(self) -> None:
+        """End the tracker."""
+        with contextlib.suppress(TrackerFailure):
+            self._ask("close")
+
+    def _ask(self, do: str, **question: Any) -> Any:
+        raise NotImplementedError
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
-class Worker:
+class Worker(_Asked):
     """A tracker in a process of its own: a `lae_sim.timed.TimedTracker`, for ``with``.
 
     The process stays over sequences. One that crashes or takes too long is ended, with all that it
@@ -71,7 +99,8 @@ class Worker:
     ) -> None:
         if os.name != "posix":
             raise LaeError("worker processes need Linux or macOS: run the tracker in this process")
-        self._tracker, self._options, self._threads = tracker, dict(options), threads
+        self._tracker, self._threads = tracker, threads
+        self._setup = {"tracker": tracker, "options": dict(options), "threads": threads}
         self._python = python or sys.executable
         self._timeout, self._setup_timeout = timeout, setup_timeout
         self._process: subprocess.Popen[bytes] | None = None
@@ -79,69 +108,27 @@ class Worker:
         self._memory: mmap.mmap | bytes = b""
         self._said = b""
         self._files = contextlib.ExitStack()
+        # files without a name: nothing of them can be left behind
         self._log = self._files.enter_context(tempfile.TemporaryFile(buffering=0))  # noqa: SIM115
-        self._frames = self._files.enter_context(_shared_file())
+        self._frames = self._files.enter_context(_memory())
         try:
             self._start()
         except BaseException:
             self.close()
             raise
 
-    @property
-    def sets_search(self) -> bool:
-        """Whether the tracker can be told where to search."""
-        return self._sets_search
-
-    def init(self, frame: Image, box: Sequence[float]) -> Answer:
-        """Start on a new sequence, in a new process if there is none.
-
-        Raises:
-            TrackerFailure: if the tracker raises, crashes or takes too long.
-            LaeError: if it cannot be made any more.
-        """
-        if self._process is None or self._process.poll() is not None:
-            self._start()
-        shape = self._hand_over(frame)
-        return _answer(self._ask("init", self._timeout, shape=shape, box=_four(box)))
-
-    def track(self, frame: Image, search: Sequence[float] | None = None) -> Answer:
-        """Find the target, around ``cx, cy, w, h`` if ``search`` is given.
-
-        Raises:
-            TrackerFailure: if the tracker raises, crashes, takes too long, answers anything but a
-                box, or has not been initialised.
-        """
-        if self._process is None:
-            raise TrackerFailure(f"{self._tracker}: the tracker must be initialised first")
-        shape = self._hand_over(frame)
-        where = None if search is None else _four(search)
-        return _answer(self._ask("track", self._timeout, shape=shape, search=where))
-
-    def describe(self) -> Mapping[str, Any]:
-        """What the tracker says of itself, and the interpreter and libraries it runs on."""
-        if self._process is None:
-            self._start()
-        found: Mapping[str, Any] = self._ask("describe", self._timeout)
-        return found
-
     def close(self) -> None:
         """End the tracker and its process."""
         try:
             if self._process is not None:
                 with contextlib.suppress(TrackerFailure, subprocess.TimeoutExpired):
-                    self._ask("close", CLOSE_S)
+                    self._exchange("close", CLOSE_S, {})
                     self._control.close()  # on which it exits by itself
                     self._process.wait(CLOSE_S)
         finally:
             self._kill()
             self._memory = b""
             self._files.close()
-
-    def __enter__(self) -> Worker:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _start(self) -> None:
         self._kill()
@@ -166,13 +153,7 @@ class Worker:
                 ours.close()
                 raise LaeError(f"{self._python} does not start: {error.strerror}") from error
         try:
-            self._sets_search: bool = self._ask(
-                "setup",
-                self._setup_timeout,
-                tracker=self._tracker,
-                options=self._options,
-                threads=self._threads,
-            )
+            self.sets_search = self._exchange("setup", self._setup_timeout, self._setup)
         except TrackerFailure as error:
             hint = ""
             if self._process is None and self._python != sys.executable:  # it gave no answer
@@ -180,8 +161,16 @@ class Worker:
             self._kill()
             raise LaeError(f"{error}{hint}") from None
 
+    def _ask(self, do: str, **question: Any) -> Any:
+        if self._process is None and do == "track":
+            raise TrackerFailure(f"{self._tracker}: the tracker must be initialised first")
+        if self._process is None or (do == "init" and self._process.poll() is not None):
+            self._start()
+        if "frame" in question:
+            question["shape"] = self._hand_over(question.pop("frame"))
+        return self._exchange(do, self._timeout, question)
+
     def _hand_over(self, frame: Image) -> tuple[int, ...]:
-        _check_frame(frame)
         if frame.nbytes > len(self._memory):
             os.truncate(self._frames.fileno(), frame.nbytes)
             self._memory = mmap.mmap(self._frames.fileno(), frame.nbytes)
@@ -189,7 +178,7 @@ class Worker:
         np.copyto(shared, frame)
         return frame.shape
 
-    def _ask(self, do: str, limit: float, **question: Any) -> Any:
+    def _exchange(self, do: str, limit: float, question: Mapping[str, Any]) -> Any:
         line = json.dumps({"do": do, **question}).encode() + b"\n"
         try:
             with contextlib.suppress(ConnectionError):  # the death is found where answers are read
@@ -213,7 +202,9 @@ class Worker:
             if left <= 0:
                 raise TrackerFailure(f"{self._tracker}: {do} exceeded {limit:g} s")
             if self._poll.poll(1000 * min(left, GLANCE_S)):
-                part = _received(self._control)
+                part = b""
+                with contextlib.suppress(ConnectionError):  # it died with a question unread
+                    part = self._control.recv(65536)
                 line, dead = line + part, not part
             else:  # a child of the tracker may hold the socket open
                 dead = self._process.poll() is not None
@@ -230,7 +221,7 @@ class Worker:
         if code == -signal.SIGKILL:
             how += " (out of memory?)"
         words, _, crash = self._said.decode(errors="replace").partition("Fatal Python error")
-        place = _FIRST_FRAME.search(crash)
+        place = re.search(r"most recent call first\):\n\s*(File .*)", crash)
         said = words.split("\n")[-2:-1] + ([place[1]] if place else [])
         return ": ".join([f"the process {how}"] + [line for line in said if line])
 
@@ -259,7 +250,7 @@ class Worker:
         return code
 
 
-class InProcess:
+class InProcess(_Asked):
     """A tracker in this process: a `lae_sim.timed.TimedTracker`, for ``with``, to debug a tracker.
 
     Nothing stops it when it hangs or crashes, and the libraries keep the threads that they were
@@ -279,51 +270,11 @@ class InProcess:
     ) -> None:
         self._tracker = tracker
         self._stopwatch = Stopwatch(tracker, options, threads)
+        self.sets_search = self._stopwatch.sets_search
 
-    @property
-    def sets_search(self) -> bool:
-        """Whether the tracker can be told where to search."""
-        return self._stopwatch.sets_search
-
-    def init(self, frame: Image, box: Sequence[float]) -> Answer:
-        """Start on a new sequence.
-
-        Raises:
-            TrackerFailure: if the tracker raises.
-        """
-        _check_frame(frame)
-        return _answer(self._ask("init", frame, _four(box)))
-
-    def track(self, frame: Image, search: Sequence[float] | None = None) -> Answer:
-        """Find the target, around ``cx, cy, w, h`` if ``search`` is given.
-
-        Raises:
-            TrackerFailure: if the tracker raises, answers anything but a box, or has not been
-                initialised.
-        """
-        _check_frame(frame)
-        where = None if search is None else _four(search)
-        return _answer(self._ask("track", frame, where))
-
-    def describe(self) -> Mapping[str, Any]:
-        """What the tracker says of itself, and the interpreter and libraries it runs on."""
-        found: Mapping[str, Any] = self._ask("describe")
-        return found
-
-    def close(self) -> None:
-        """End the tracker."""
-        with contextlib.suppress(TrackerFailure):
-            self._ask("close")
-
-    def __enter__(self) -> InProcess:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _ask(self, do: str, *arguments: Any) -> Any:
+    def _ask(self, do: str, **question: Any) -> Any:
         try:
-            return getattr(self._stopwatch, do)(*arguments)
+            return getattr(self._stopwatch, do)(**question)
         except LaeError as error:
             raise TrackerFailure(f"{self._tracker}: {do}: {error}") from error
 
@@ -333,9 +284,10 @@ def _answer(found: dict[str, Any]) -> Answer:
     return Answer(box=None if box is None else tuple(box), **found)
 
 
-def _check_frame(frame: Image) -> None:
+def _checked(frame: Image) -> Image:
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
         raise LaeError(f"a frame is uint8 [H, W, 3], not {frame.dtype} {list(frame.shape)}")
+    return frame
 
 
 def _four(box: Sequence[float]) -> list[float]:
@@ -345,15 +297,7 @@ def _four(box: Sequence[float]) -> list[float]:
     return numbers
 
 
-def _received(control: socket.socket) -> bytes:
-    try:
-        return control.recv(65536)
-    except ConnectionError:  # it died with a question unread
-        return b""
-
-
-def _shared_file() -> IO[bytes]:
-    """A file without a name: nothing of it can be left behind."""
+def _memory() -> IO[bytes]:
     if hasattr(os, "memfd_create"):
-        return open(os.memfd_create("lae_sim frames"), "r+b", buffering=0)
+        return os.fdopen(os.memfd_create("frames"), "r+b", 0)
     return tempfile.TemporaryFile(buffering=0)

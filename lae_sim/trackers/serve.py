@@ -39,11 +39,7 @@ def main() -> None:
 
 
 class Server:
-    """Answers questions about one tracker.
-
-    Args:
-        frames: file descriptor of the memory that frames are handed over in.
-    """
+    """Answers questions about one tracker; ``frames`` is the descriptor of the memory."""
 
     def __init__(self, frames: int) -> None:
         self._file = frames
@@ -85,11 +81,10 @@ def _die_with_parent() -> None:
     Elsewhere the end of the socket does it, as soon as the tracker returns.
     """
     if sys.platform.startswith("linux"):
-        try:
+        with contextlib.suppress(ImportError):  # an interpreter built without ctypes
             import ctypes
-        except ImportError:  # an interpreter built without it
-            return
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+            ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 def _prepare_imports() -> None:

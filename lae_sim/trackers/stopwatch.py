@@ -11,14 +11,11 @@ import textwrap
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter_ns, process_time_ns
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lae_sim.errors import LaeError
 from lae_sim.trackers.names import make_tracker
 from lae_sim.trackers.protocol import Image
-
-if TYPE_CHECKING:
-    from typing import TypeGuard  # from Python 3.10 on
 
 LARGEST = 1e9
 """The largest number in a box, pixels: what lies beyond is no place in an image."""
@@ -26,17 +23,7 @@ LARGEST = 1e9
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """The environment variables that libraries read when they are imported."""
 
-_LIBRARIES = {
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "cv2": "opencv",
-    "torch": "torch",
-    "torchvision": "torchvision",
-    "onnxruntime": "onnxruntime",
-    "tensorrt": "tensorrt",
-    "tensorflow": "tensorflow",
-    "jax": "jax",
-}
+_LIBRARIES = ("numpy", "scipy", "cv2", "torch", "torchvision", "onnxruntime", "tensorrt")
 
 
 class Stopwatch:
@@ -162,6 +149,8 @@ def _plain(output: Any) -> Any:
 
 def _checked(output: Any) -> tuple[list[float] | None, float | None]:
     scored = isinstance(output, tuple) and len(output) == 2
+    box: Any
+    score: Any
     box, score = output if scored else (output, None)
     if box is not None:
         numbers = box if isinstance(box, (list, tuple)) else ()
@@ -171,15 +160,13 @@ def _checked(output: Any) -> tuple[list[float] | None, float | None]:
     return box, float(score) if _is_number(score) and math.isfinite(score) else None
 
 
-def _is_number(value: Any) -> TypeGuard[float]:
+def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _versions() -> dict[str, str]:
-    found = {
-        name: getattr(sys.modules.get(module), "__version__", None)
-        for module, name in _LIBRARIES.items()
-    }
+    found = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
+    found["opencv"] = found.pop("cv2")
     return {name: str(version) for name, version in found.items() if version is not None}
 
 
