@@ -266,7 +266,7 @@ def test_close_leaves_nothing(started: Callable[..., Trax]) -> None:
     open_before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
     tracker = started("static")
     tracker.init(FRAME, BOX)
-    process, folder = pid(tracker), Path(tracker._folder)
+    process, folder = pid(tracker), Path(tracker._folder.name)
     assert folder.is_dir()
     tracker.close()
     assert not folder.exists()
@@ -281,7 +281,8 @@ def test_what_a_killed_process_left_is_removed(
 ) -> None:
     program = (
         "import os, signal, sys; from lae_sim.trackers.trax import Trax\n"
-        "tracker = Trax(sys.argv[1]); print(tracker._folder, tracker._process.pid, flush=True)\n"
+        "tracker = Trax(sys.argv[1]); print(tracker._folder.name, flush=True)\n"
+        "print(tracker._process.pid, flush=True)\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
     killed = subprocess.run(
@@ -296,9 +297,9 @@ def test_what_a_killed_process_left_is_removed(
     assert Path(folder).exists()
     other = started("static")
     assert not Path(folder).exists()
-    assert Path(other._folder).exists()
+    assert Path(other._folder.name).exists()
     started("static")
-    assert Path(other._folder).exists()  # it is in use
+    assert Path(other._folder.name).exists()  # it is in use
     assert dies(int(process))  # its connection ended with the process
 
 

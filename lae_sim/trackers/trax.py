@@ -6,7 +6,6 @@ L. Čehovin, "TraX: The visual Tracking eXchange protocol and library", Neurocom
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import glob
 import os
 import select
@@ -16,7 +15,6 @@ import socket
 import struct
 import subprocess
 import tempfile
-import weakref
 from typing import Any
 
 import numpy as np
@@ -24,8 +22,6 @@ import numpy as np
 from lae_sim.errors import LaeError
 from lae_sim.trackers.protocol import Box, Image, Output
 
-SHARED_MEMORY = "/dev/shm"
-ROOM = 2**28
 FOLDER = "lae-sim-trax-"
 PATIENCE_S = 1.0
 
@@ -59,10 +55,8 @@ class Trax:
         self._parameters = {name: str(value) for name, value in parameters.items()}
         self._client: Any = None
         self._fresh, self._lasting = False, True
-        self._session, files = contextlib.ExitStack(), contextlib.ExitStack()
-        self._folder = files.enter_context(_folder())
-        files.callback(self._session.close)
-        self._close = weakref.finalize(self, files.close)
+        self._session = contextlib.ExitStack()
+        self._folder = _folder()
         self._bitmaps: list[tuple[str, Any]] = []
         self._shape: tuple[int, ...] = ()
         try:
@@ -119,7 +113,7 @@ class Trax:
         """End the program."""
         self._end()
         self._bitmaps, self._shape = [], ()
-        self._close()
+        self._folder.cleanup()
 
     def _start(self) -> None:
         with socket.socket() as listener:  # not its standard output, on which it may print
@@ -157,7 +151,7 @@ class Trax:
         if self._trax.Image.PATH not in self._client.image_formats:
             return {"color": self._trax.MemoryImage.create(frame[:, :, ::-1])}
         if frame.shape != self._shape:
-            paths = [os.path.join(self._folder, name) for name in ("even.bmp", "odd.bmp")]
+            paths = [os.path.join(self._folder.name, name) for name in ("even.bmp", "odd.bmp")]
             self._bitmaps = [(path, _bitmap(path, *frame.shape[:2])) for path in paths]
             self._shape = frame.shape
         self._bitmaps.reverse()
@@ -211,36 +205,20 @@ def _box(region: Any) -> tuple[float, float, float, float] | None:
         points = np.array(list(region))
         (x, y), (w, h) = points.min(axis=0), np.ptp(points, axis=0)
     elif region.type == "mask" and region.array().any():
-        rows, columns = np.nonzero(region.array())
-        left, top = region.offset()
-        x, y = left + columns.min(), top + rows.min()
-        w, h = np.ptp(columns) + 1, np.ptp(rows) + 1
+        points = np.argwhere(region.array())[:, ::-1] + region.offset()
+        (x, y), (w, h) = points.min(axis=0), np.ptp(points, axis=0) + 1
     else:
         return None
     return (float(x), float(y), float(w), float(h)) if w > 0 and h > 0 else None
 
 
-@contextlib.contextmanager
 def _folder() -> Any:
     """A folder in shared memory; those of processes that were killed are removed."""
-    shared = os.path.isdir(SHARED_MEMORY) and shutil.disk_usage(SHARED_MEMORY).free > ROOM
-    parent = SHARED_MEMORY if shared else tempfile.gettempdir()
-    for old in glob.glob(os.path.join(parent, FOLDER + "*")):
-        with contextlib.suppress(OSError), _locked(old):
-            shutil.rmtree(old)
-    with tempfile.TemporaryDirectory(prefix=FOLDER, dir=parent) as made, _locked(made):
-        yield made
-
-
-@contextlib.contextmanager
-def _locked(folder: str) -> Any:
-    """Hold a folder's lock, which the kernel gives back if the process is killed."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)
+    for old in glob.glob(f"/dev/shm/{FOLDER}*"):
+        if not os.path.exists(f"/proc/{old.split('-')[-2]}"):
+            shutil.rmtree(old, ignore_errors=True)
+    parent = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    return tempfile.TemporaryDirectory(prefix=f"{FOLDER}{os.getpid()}-", dir=parent)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
