@@ -37,10 +37,10 @@ SMALLEST = 32.0  # side of the search window, pixels of the frame
 
 # With the mean energy of the channels as unit: the penalty that ties the filter to the one before,
 # the step size of ADMM and its growth, the ridge.
-TEMPORAL, STEP, GROWTH, RIDGE = 20.0, 0.01, 4.0, 0.01
+TEMPORAL, STEP, GROWTH, RIDGE = 15.0, 0.01, 4.0, 0.01
 ITERATIONS = 2
 
-SCALE_RATE = 0.025
+SCALE_RATE, PSR_RATE = 0.025, 0.05  # of running averages
 
 
 class Dcf:
@@ -51,7 +51,8 @@ class Dcf:
         padding: side of the search window over the target's ``sqrt(w * h)``.
         scales: number of scales that are compared; 1 keeps the size.
         scale_step: ratio of one scale to the next.
-        min_psr: peak-to-sidelobe ratio below which a frame is not learnt from.
+        min_psr: share of its mean below which the peak-to-sidelobe ratio means that the target is
+            not seen: the box stays, and the frame is not learnt from.
 
     Raises:
         LaeError: if the device cannot be used, or a setting is out of range.
@@ -63,7 +64,7 @@ class Dcf:
         padding: float = 4.0,
         scales: int = 17,
         scale_step: float = 1.03,
-        min_psr: float = 7.0,
+        min_psr: float = 0.3,
     ) -> None:
         if not (padding > 1 and scales >= 1 and scales % 2 and 1 < scale_step < 2):
             raise LaeError("dcf: padding must exceed 1, scales be odd, scale_step within 1..2")
@@ -100,6 +101,7 @@ class Dcf:
         self._size = np.array([w, h])
         self._centre = np.array([x + w / 2, y + h / 2])  # of pixel edges: 0 is the image's corner
         self._keep_inside(frame)
+        self._mean_psr = 0.0
         half_cells = self._size / self._side() * CELLS / 2
         columns, rows = (abs(np.arange(CELLS) - CELLS // 2) <= half + 0.5 for half in half_cells)
         self._mask = self._to(np.outer(rows, columns).astype(np.float32))
@@ -130,11 +132,11 @@ class Dcf:
         if not self._started:
             raise LaeError("dcf: init must come before track")
         self._keep_inside(frame)
-        response = self._response(self._channels(frame))
-        peak, psr = _peak(response)
-        self._centre += (peak - CELLS // 2) * self._side() / CELLS
-        self._keep_inside(frame)
-        if psr >= self._min_psr:
+        shift, psr = _peak(self._response(self._channels(frame)))
+        if psr >= self._min_psr * self._mean_psr:
+            self._mean_psr += PSR_RATE * (psr - self._mean_psr) if self._mean_psr else psr
+            self._centre += shift * self._side() / CELLS
+            self._keep_inside(frame)
             self._rescale(frame)
             self._learn(frame)
         (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
@@ -168,8 +170,9 @@ class Dcf:
         return self._fft.rfft2(self._to(found * self._window))
 
     def _response(self, x: Any) -> Array:
-        response = self._fft.irfft2((self._filter.conj() * x).sum(0), (CELLS, CELLS))
-        return np.fft.fftshift(response.cpu().numpy() if self._torch else response)
+        """Fourier transform of the filter's response, complex64 [CELLS, CELLS/2 + 1]."""
+        response = (self._filter.conj() * x).sum(0)
+        return response.cpu().numpy() if self._torch else response
 
     def _learn(self, frame: Image) -> None:
         """Bring the filters up to date.
@@ -309,19 +312,29 @@ def _gaussian(count: int, sigma: float) -> Array:
     return np.fft.ifftshift(np.exp(-0.5 * ((np.arange(count) - count // 2) / sigma) ** 2))
 
 
-def _peak(response: Array) -> tuple[Array, float]:
-    """Where the response is largest (x, y in cells, between cells too), and the ratio of [6]."""
-    r = response.astype(np.float64)
+def _peak(transformed: Array) -> tuple[Array, float]:
+    """Where the response is largest: x, y from the centre in cells, and the ratio of [6]."""
+    r = np.fft.irfft2(transformed.astype(np.complex128), (CELLS, CELLS))
     row, column = (int(i) for i in np.unravel_index(r.argmax(), r.shape))
-    top = r[row, column]
-    peak = np.array([column, row], float)
-    if 0 < row < CELLS - 1 and 0 < column < CELLS - 1:
-        peak[0] += _vertex(*r[row, column - 1 : column + 2])
-        peak[1] += _vertex(*r[row - 1 : row + 2, column])
+    # between the cells the response is its Fourier series
+    fine = np.linspace(-0.75, 0.75, 13)
+    down = np.exp(2j * np.pi * np.outer(row + fine, np.fft.fftfreq(CELLS)))
+    along = np.exp(2j * np.pi * np.outer(np.fft.rfftfreq(CELLS), column + fine))
+    along[1:-1] *= 2  # the half of the spectrum that a real transform leaves out
+    near = (down @ transformed @ along).real
+    i, j = (int(k) for k in np.unravel_index(near.argmax(), near.shape))
+    step = fine[1] - fine[0]
+    x, y = column + fine[j], row + fine[i]
+    if 0 < i < len(fine) - 1 and 0 < j < len(fine) - 1:
+        x += step * _vertex(*near[i, j - 1 : j + 2])
+        y += step * _vertex(*near[i - 1 : i + 2, j])
+    half = CELLS // 2
+    shift = (np.array([x, y]) + half) % CELLS - half
+    centred = np.roll(r, (half - row, half - column), (0, 1))
     sidelobe = np.ones(r.shape, bool)
-    sidelobe[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4] = False
-    rest = r[sidelobe]
-    return peak, float((top - rest.mean()) / (rest.std() + 1e-9))
+    sidelobe[half - 3 : half + 4, half - 3 : half + 4] = False
+    rest = centred[sidelobe]
+    return shift, float((r[row, column] - rest.mean()) / (rest.std() + 1e-9))
 
 
 def _vertex(left: float, middle: float, right: float) -> float:
