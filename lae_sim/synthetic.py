@@ -44,10 +44,9 @@ class _Scene:
             of the image its path covers; above 1 it leaves the image.
         flight, shake: the camera's speed over the ground, and rms speed of its shake.
         zoom, spin: amplitudes of the logarithm of the scale, and of the camera's rotation.
-        turn, gait: how far the target turns sideways (1 is out of sight), and deforms.
+        gait: how far the target deforms.
         rivals, covers: numbers of look-alikes, and of trees that it passes under.
         exposure: share of the time between two frames.
-        light: amplitude of the logarithm of the brightness.
         clutter: number of things of the target's colour on each tile of the ground.
     """
 
@@ -64,12 +63,10 @@ class _Scene:
     shake: float = 0.8
     zoom: float = 0.12
     spin: float = 0.15
-    turn: float = 0
     gait: float = 0
     rivals: int = 0
     covers: int = 0
     exposure: float = 0
-    light: float = 0.05
     clutter: int = 0
 
 
@@ -79,15 +76,13 @@ _SCENES = (
     _Scene("car", covers=3, spin=0.5),
     _Scene("chase", colour=(60, 60, 60), rivals=3, speed=5.5, clutter=25),
     _Scene("cyclist", size=40, aspect=0.45, corner=2.5, gait=0.3, zoom=0.35, speed=5, shake=2),
-    _Scene(
-        "drone", size=36, aspect=0.9, corner=3, colour=(70, 60, 60), speed=9, shake=3, light=0.3
-    ),
+    _Scene("drone", size=36, aspect=0.9, corner=3, colour=(70, 60, 60), speed=9, shake=3),
     _Scene("herd", size=34, aspect=0.5, corner=2.3, colour=(70, 95, 120), gait=0.25, rivals=4),
     _Scene("race", colour=(40, 160, 215), speed=8, flight=14, shake=4, exposure=0.6, spin=0.5),
     _Scene("runner", size=30, aspect=0.6, corner=2.2, gait=0.4, covers=2, clutter=40, speed=4),
-    _Scene("skater", size=44, aspect=0.55, corner=2.3, gait=0.35, turn=0.45, speed=6, spin=0.9),
+    _Scene("skater", size=44, aspect=0.55, corner=2.3, gait=0.35, speed=6, spin=0.9),
     _Scene("truck", size=70, aspect=0.42, colour=(170, 120, 50), reach=1.15, zoom=0.3, speed=6),
-    _Scene("van", size=58, colour=(200, 205, 210), turn=0.35, zoom=0.45, exposure=0.4, shake=4),
+    _Scene("van", size=58, colour=(200, 205, 210), zoom=0.45, exposure=0.4, shake=4),
 )
 
 
@@ -129,7 +124,6 @@ def _attributes(scene: _Scene, path: _Path, truth: Floats, visible: Floats) -> t
         "Deformation": scene.gait > 0,
         "Fast camera motion": scene.shake >= 3 or scene.flight > 10,
         "In-plane rotation": np.ptp(angle) > np.pi / 2,
-        "Out-of-plane rotation": scene.turn > 0,
         "Out-of-view": visible.min() < 0.5,
         "Background clutter": scene.clutter > 0,
         "Similar objects around": scene.rivals > 0,
@@ -156,11 +150,9 @@ class _Path:
         self._start = rng.uniform(0, TILE, 2)
         rates = rng.uniform(0.02, 0.05, (2, 2))
         self._drift = _sines(rates, np.full((2, 2), 25.0), _phases(rng, 2, 2))
-        self.light = _slow(rng, scene.light)
         self._zoom, self._spin, self._yaw = (
             _slow(rng, amplitude) for amplitude in (scene.zoom, scene.spin, 0.1)
         )
-        self._gait, self._turn = rng.uniform(0, 6, 2)
         self._rivals = [
             _sines(
                 rng.uniform(0.035, 0.09, (2, 2)),
@@ -176,10 +168,6 @@ class _Path:
         under = time[[part[np.argmax(speed[part])] for part in parts]]
         self.covers = self.on_ground(under)
         self.crowns = scene.size * rng.uniform(1.2, 1.8, scene.covers)
-
-    def side(self, time: Floats) -> Floats:
-        """How much of the target's side shows, 0 to ``turn``."""
-        return np.asarray(self.scene.turn * (0.5 - 0.5 * np.cos(0.06 * time + self._turn)), float)
 
     def camera(self, time: Floats) -> tuple[Floats, Floats, Floats]:
         """Ground to image: matrices [n, 2, 2], the ground's point [n, 2] at the image's [n, 2]."""
@@ -206,11 +194,10 @@ class _Path:
         """Target to image: matrices [n, 2, 2], and its middle in the image [n, 2]."""
         matrix, there, here = self.camera(time)
         place = here + np.einsum("nij,nj->ni", matrix, self.on_ground(time, rival) - there)
-        phase = 0.55 * time + self._gait + 2.0 * (rival or 0)
-        shape = np.zeros((len(time), 2, 2))
-        shape[:, 0, 0] = 1 + 0.5 * self.scene.gait * np.sin(phase)
-        shape[:, 0, 1] = self.scene.gait * np.sin(phase + 1)
-        shape[:, 1, 1] = 1 - self.side(time)
+        phase = 0.55 * time + 2.0 * (rival or 0)
+        shape = np.tile(np.eye(2), (len(time), 1, 1))
+        shape[:, 0, 0] += 0.5 * self.scene.gait * np.sin(phase)
+        shape[:, 0, 1] += self.scene.gait * np.sin(phase + 1)
         zoom = np.exp(self._zoom(time))[:, None, None]
         return zoom * _rotation(self.angle(time)) @ shape, place
 
@@ -233,7 +220,6 @@ class _Layer(NamedTuple):
     picture: Image
     matrix: Floats  # picture to image, [n, 2, 2]
     place: Floats  # of the picture's middle, [n, 2]
-    opacity: Floats | float = 1.0
 
 
 class _Film:
@@ -253,26 +239,15 @@ class _Film:
         inverse = np.linalg.inv(matrix)
         corner = there % TILE + _MARGIN - np.einsum("nij,nj->ni", inverse, here)
         self._views = np.concatenate([inverse, corner[..., None]], axis=2)
-        self._gain = np.exp(path.light(time))
         self._layers: list[_Layer] = []
-        pattern = rng.integers(1 << 32)
+        pattern, size = rng.integers(1 << 32), (scene.size, scene.size * scene.aspect)
         for number in [*range(scene.rivals), None]:
-            shift = 0 if number is None else rng.normal(0, 12, 3)
+            colour = np.array(scene.colour) + (0 if number is None else rng.normal(0, 12, 3))
+            body = sprite(np.random.default_rng(pattern), size, scene.corner, colour)
+            shadow = np.asarray(body * [0, 0, 0, 0.45], np.uint8)
             moved, place = path.target(time, number)
-            body, side = (
-                sprite(
-                    np.random.default_rng(pattern + look),
-                    (scene.size, scene.size * scene.aspect),
-                    scene.corner,
-                    np.array(scene.colour) * (1 - 0.3 * look) + shift,
-                )
-                for look in (0, 1)
-            )
-            shadow = body * np.array([0, 0, 0, 1], np.uint8)
-            below = place + 0.06 * scene.size * matrix.sum(axis=2)
-            self._layers += [_Layer(shadow, moved, below, 0.45), _Layer(body, moved, place)]
-            if scene.turn:
-                self._layers.append(_Layer(side, moved, place, path.side(time)))
+            below = place + 0.06 * scene.size * moved.sum(axis=2)
+            self._layers += [_Layer(shadow, moved, below), _Layer(body, moved, place)]
         for where, width in zip(path.covers, path.crowns):
             crown = tree(rng, 160)
             place = here + np.einsum("nij,nj->ni", matrix, where - there)
@@ -283,31 +258,23 @@ class _Film:
         import cv2
 
         moments = range(frame * self._steps, (frame + 1) * self._steps)
-        if self._steps == 1:
-            image = self._snapshot(frame, cv2.INTER_LINEAR)
-        else:
-            total = np.zeros((*_SIZE[::-1].astype(int), 3), np.float32)
-            for moment in moments:
-                cv2.accumulate(self._snapshot(moment, cv2.INTER_NEAREST), total)
-            image = np.asarray(cv2.convertScaleAbs(total, alpha=1 / self._steps), np.uint8)
+        total = np.zeros((*_SIZE[::-1].astype(int), 3), np.float32)
+        for moment in moments:
+            cv2.accumulate(self._snapshot(moment), total)
+        image = cv2.convertScaleAbs(total, alpha=1 / self._steps)
         y, x = _rng(self._scene, f"noise {frame}").integers(0, (180, 320))
         noise = self._noise[y : y + 360, x : x + 640]
-        gain = float(self._gain[moments[self._steps // 2]])
-        return np.asarray(cv2.addWeighted(image, gain, noise, 1, -32), np.uint8)
+        return np.asarray(cv2.addWeighted(image, 1, noise, 1, -32), np.uint8)
 
-    def _snapshot(self, moment: int, flags: int) -> Image:
+    def _snapshot(self, moment: int) -> Image:
         import cv2
 
+        flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
         size = _SIZE.astype(int).tolist()
-        flags |= cv2.WARP_INVERSE_MAP
         view = self._views[moment]
         image = np.asarray(cv2.warpAffine(self._ground, view, size, flags=flags), np.uint8)
         for layer in self._layers:
-            picture, opacity = layer.picture, np.broadcast_to(layer.opacity, len(self._gain))
-            if opacity[moment] < 1:
-                faded = cv2.convertScaleAbs(picture, alpha=float(opacity[moment]))
-                picture = np.asarray(faded, np.uint8)
-            _draw(image, picture, layer.matrix[moment], layer.place[moment])
+            _draw(image, layer.picture, layer.matrix[moment], layer.place[moment])
         return image
 
 

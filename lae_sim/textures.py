@@ -21,43 +21,37 @@ _MEADOW = np.array([(42, 74, 70), (58, 104, 94), (96, 142, 146)], np.float32)
 
 
 def ground(rng: np.random.Generator, strewn: Colour, count: int) -> Image:
-    """Meadows, fields, roads, houses and trees from above, uint8 [TILE, TILE, 3]; seamless.
+    """Meadows, fields, roads and trees from above, uint8 [TILE, TILE, 3]; seamless.
 
     Args:
         rng: draws everything.
         strewn, count: colour and number of small things that lie about.
     """
     meadow = _MEADOW + rng.normal(0, 8, 3).astype(np.float32)
-    tone = 2 * _noise(rng, TILE)[..., None]
-    tile = np.where(
-        tone < 1,
-        meadow[0] + (meadow[1] - meadow[0]) * tone,
-        meadow[1] + (meadow[2] - meadow[1]) * (tone - 1),
-    ).astype(np.float32)
-    for _ in range(9):
+    tone = _noise(rng, TILE)[..., None]
+    tile = np.asarray(meadow[0] + (meadow[2] - meadow[0]) * tone, np.float32)
+    for _ in range(12):
         colour = meadow[rng.integers(3)] * rng.uniform(0.8, 1.3) + rng.normal(0, 7, 3)
-        field = _rectangle(rng, rng.uniform(110, 260), rng.uniform(80, 160))
-        _paint(tile, field, colour)
-        for share in np.linspace(0.05, 0.95, 12):  # furrows
-            a = field[0] + share * (field[1] - field[0])
-            b = field[3] + share * (field[2] - field[3])
-            width = 0.012 * (field[1] - field[0])
-            _paint(tile, np.array([a - width, a + width, b + width, b - width]), 0.9 * colour)
+        _paint(tile, _rectangle(rng, rng.uniform(110, 260), rng.uniform(80, 160)), colour)
     for across in (False, True, True):
-        _road(tile, rng, across)
-    for _ in range(9):
-        _house(tile, rng)
+        along = np.linspace(-16, TILE + 16, 140)
+        bend = rng.uniform(20, 70) * np.sin(2 * np.pi * along / TILE + rng.uniform(0, 6))
+        road = np.stack([along, rng.uniform(0, TILE) + bend], axis=1)
+        for side, grey in ((36, 90), (30, 125), (1.5, 205)):  # a verge, asphalt, a line along it
+            edges = np.concatenate([road - [0, side], (road + [0, side])[::-1]])
+            _paint(tile, edges[:, ::-1] if across else edges, [grey] * 3)
     for _ in range(count):
         thing = _rectangle(rng, *rng.uniform(14, 44, 2))
         _paint(tile, thing + 3, meadow[0] * 0.5)
         _paint(tile, thing, np.asarray(strewn) * rng.uniform(0.75, 1.25) + rng.normal(0, 10, 3))
-    for _ in range(60):
+    for _ in range(70):
         middle, radius = rng.uniform(0, TILE, 2), rng.uniform(7, 22)
-        _paint(tile, _round(rng, middle + 0.35 * radius, radius), meadow[0] * 0.45)
-        colour = meadow[rng.integers(2)] * rng.uniform(0.6, 1.0)
-        for part in np.linspace(1, 0.3, 4):
-            _paint(tile, _round(rng, middle - 0.3 * (1 - part) * radius, part * radius), colour)
-            colour = colour * 1.14
+        angle = np.linspace(0, 2 * np.pi, 14, endpoint=False)
+        crown = (
+            radius * rng.uniform(0.85, 1.15, (14, 1)) * np.stack([np.cos(angle), np.sin(angle)], 1)
+        )
+        for part, shade in ((1.2, 0.45), (1, 0.8), (0.5, 1.1)):  # its shadow, leaves, light on them
+            _paint(tile, middle + part * crown + 6 * (part - 1), meadow[1] * shade)
     grain = 0.7 + 0.6 * _noise(rng, TILE, 0.35)[..., None]
     return np.asarray(np.clip(tile * grain, 0, 255), np.uint8)
 
@@ -85,25 +79,11 @@ def sprite(
     u, v = x / half[0], y / half[1]
     inside = np.abs(u) ** corner + np.abs(v) ** corner
     body = np.ones((*u.shape, 3)) * np.asarray(colour, float)
-    light = np.clip(np.sum(colour) / 3 + 70, 110, 240)
-    if corner > 4:  # a vehicle: windows across, a stripe or a load
-        for at, width in (
-            (0.42, 0.16),
-            (-0.72, 0.09),
-            *zip(rng.uniform(-0.6, 0.2, 2), (0.05, 0.03)),
-        ):
-            body[np.abs(u - at - 0.06 * v**2) < width] = (45, 40, 35)
-        body[np.abs(v - rng.uniform(-0.4, 0.4)) < 0.13] *= 0.55
-        body[(np.abs(u + 0.2) < 0.2) & (np.abs(v) < 0.55)] += rng.uniform(-50, 50, 3)
-        body[np.abs(v) > 0.86] *= 0.6
-        body[(u > 0.86) & (np.abs(np.abs(v) - 0.6) < 0.2)] = (200, 235, 240)
-    else:  # something alive, or a hull: a head, a back, limbs
-        body[np.abs(v) > 0.6] *= 0.6
-        body[(np.abs(np.sin(6 * u + rng.uniform(0, 6))) < 0.35)] *= rng.uniform(0.6, 0.8)
-        body[(u + 0.1) ** 2 / 0.3 + v**2 / 0.16 < 1] = np.clip(
-            light + rng.normal(0, 15, 3), 20, 250
-        )
-        body[(u - 0.45) ** 2 * (half[0] / half[1]) ** 2 + v**2 < 0.14] = (60, 75, 105)
+    for at in (0.42, -0.75, rng.uniform(-0.5, 0.2)):  # windows, or stripes of a coat
+        body[np.abs(u - at - 0.06 * v**2) < rng.uniform(0.06, 0.15)] = (45, 40, 35)
+    body[np.abs(v - rng.uniform(-0.4, 0.4)) < 0.13] *= 0.55
+    body[(np.abs(u + 0.2) < 0.2) & (np.abs(v) < 0.55)] += rng.uniform(-60, 60, 3)
+    body[(u > 0.8) & (np.abs(np.abs(v) - 0.5) < 0.2)] = (200, 235, 240)  # it heads to the right
     body[inside > 0.85] *= 0.7
     body *= 0.85 + 0.3 * cv2.resize(rng.random((10, 16)), u.shape[::-1])[..., None]
     alpha = (inside <= 1)[..., None] * 255.0
@@ -159,38 +139,3 @@ def _rectangle(rng: np.random.Generator, length: float, width: float) -> Floats:
     across = np.array([-np.sin(angle), np.cos(angle)]) * width / 2
     corners = np.array([-along - across, along - across, along + across, across - along])
     return corners + rng.uniform(0, TILE, 2)
-
-
-def _round(rng: np.random.Generator, middle: Floats, radius: float) -> Floats:
-    angle = np.linspace(0, 2 * np.pi, 14, endpoint=False)
-    reach = radius * rng.uniform(0.85, 1.15, (14, 1))
-    return np.asarray(middle + reach * np.stack([np.cos(angle), np.sin(angle)], axis=1), float)
-
-
-def _road(tile: Single, rng: np.random.Generator, across: bool) -> None:
-    along = np.linspace(-16, TILE + 16, 140)
-    bend = rng.uniform(20, 70) * np.sin(2 * np.pi * along / TILE + rng.uniform(0, 6))
-    middle = rng.uniform(0, TILE) + bend
-    width, grey = rng.uniform(20, 38), rng.uniform(95, 135)
-
-    def strip(low: float, high: float, part: slice, colour: float) -> None:
-        there = np.stack([along[part], middle[part] + low], axis=1)
-        back = np.stack([along[part], middle[part] + high], axis=1)[::-1]
-        points = np.concatenate([there, back])
-        _paint(tile, points[:, ::-1] if across else points, (colour, colour, 0.97 * colour))
-
-    strip(-width - 5, width + 5, slice(None), 0.72 * grey)
-    strip(-width, width, slice(None), grey)
-    for start in range(0, 138, 5):
-        strip(-1.5, 1.5, slice(start, start + 3), 205)
-    for edge in (-width + 4, width - 4):
-        strip(edge - 1, edge + 1, slice(None), 185)
-
-
-def _house(tile: Single, rng: np.random.Generator) -> None:
-    roof = _rectangle(rng, rng.uniform(50, 120), rng.uniform(36, 70))
-    colour = np.array([(70, 80, 140), (150, 150, 155), (95, 100, 110)][rng.integers(3)], float)
-    _paint(tile, roof + 9, (30, 38, 36))
-    _paint(tile, roof, 0.8 * colour)
-    ridge = (roof[:2] + roof[[3, 2]]) / 2
-    _paint(tile, np.concatenate([roof[:2], ridge[::-1]]), 1.15 * colour)
