@@ -7,6 +7,7 @@ looked for where the official layouts have them; so no layout needs to be named.
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
@@ -79,10 +80,9 @@ def find_dataset(
     if root is None:
         if name not in (None, "synthetic"):
             raise LaeError(f"give the folder of {name} with --root; only synthetic needs none")
-        made = synthetic_dataset()
-        known = {sequence.name: sequence for sequence in made.sequences}
-        chosen = _choose(sequences, known, "the synthetic dataset")
-        return Dataset(made.name, fps or made.fps, [known[sequence] for sequence in chosen])
+        made = {sequence.name: sequence for sequence in synthetic_dataset().sequences}
+        chosen = _choose(sequences, made, "the synthetic dataset")
+        return Dataset("synthetic", fps or Fraction(30), [made[name] for name in chosen])
     if root.is_file() or box is not None:
         return _without_truth(name, root, sequences, box, fps)
     name = _SPELLINGS.get((name or "").lower(), name)
@@ -91,15 +91,11 @@ def find_dataset(
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
-    chosen = _choose(sequences, truth.files, str(root), truth.match)
-    return Dataset(
-        name,
-        fps or Fraction(_FPS.get(name, 30)),
-        [
-            _sequence(root, sequence, truth.files[sequence], attributes.get(sequence, ()))
-            for sequence in chosen
-        ],
-    )
+    found = [
+        _sequence(root, sequence, truth.files[sequence], attributes.get(sequence, ()))
+        for sequence in _choose(sequences, truth.files, str(root), truth.match)
+    ]
+    return Dataset(name, fps or Fraction(_FPS.get(name, 30)), found)
 
 
 def _without_truth(
@@ -150,27 +146,21 @@ def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) ->
 
 def _find_images(root: Path, name: str, file: Path) -> tuple[list[Path], int | None]:
     """A sequence's images, and the number of its first one if others share the folder."""
-    home = file.parent
-    places: list[tuple[Path, Path | None]]
+    home, clip = file.parent, _CLIP.match(name)
     if file.name.startswith("groundtruth"):
-        places = [(home / place, None) for place in _BESIDE_TRUTH]
+        bases, patterns, folders = [home], list(_BESIDE_TRUTH), [name]
     else:
-        clip = _CLIP.match(name)
-        shared = [(clip[1], file)] if clip else []
-        bases = dict.fromkeys((root, home, home.parent, home.parent.parent))
-        places = [
-            (base / place.format(folder), clip_file)
-            for folder, clip_file in [(name, None), *shared]
-            for base in bases
-            for place in _BESIDE_ANNOTATIONS
-        ]
-    for place, clip_file in places:
-        paths = _list_images(place)
-        if paths:
-            return paths, _clip_first(clip_file) if clip_file else None
-    base, patterns = (home, _BESIDE_TRUTH) if len(places) == 3 else (root, _BESIDE_ANNOTATIONS)
+        bases = [root, home, home.parent, home.parent.parent]
+        patterns, folders = list(_BESIDE_ANNOTATIONS), [name, *([clip[1]] if clip else [])]
+    for folder in folders:
+        for base, pattern in itertools.product(bases, patterns):
+            paths = _list_images(base / pattern.format(folder))
+            if paths:
+                return paths, _clip_first(file) if folder != name else None
     looked = ", ".join(pattern.format(name) for pattern in patterns if pattern)
-    raise LaeError(f"sequence {name!r}: no images found in {base}; looked in it, and in {looked}")
+    raise LaeError(
+        f"sequence {name!r}: no images found in {bases[0]}; looked in it, and in {looked}"
+    )
 
 
 def _clip_first(file: Path) -> int:
@@ -204,16 +194,12 @@ def _list_images(folder: Path) -> list[Path]:
     """The images in a folder, in the order of the numbers in their names."""
     if not folder.is_dir():
         return []
-    paths = [
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
-    ]
-    return sorted(paths, key=lambda path: _natural(path.name))
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
+    return sorted((path for path in paths if not path.name.startswith(".")), key=_natural)
 
 
-def _natural(name: str) -> list[str | int]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", name)]
+def _natural(path: Path) -> list[str | int]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", path.name)]
 
 
 def _read(name: str, paths: list[Path], frame: int) -> Image:

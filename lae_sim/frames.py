@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -77,13 +78,10 @@ def read_image(path: Path) -> Image:
         raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
     # Many builds of OpenCV decode a JPEG that was cut off, and fill the rest with grey.
     cut = data.startswith(_JPEG) and data.find(_END, max(data.rfind(_SCAN), 0)) < 0
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = None
-    if data and not cut:
-        try:
-            flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        except cv2.error as error:
-            raise LaeError(f"{path}: cannot be decoded: {error}") from error
+    with contextlib.suppress(cv2.error):  # of a damaged header
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and not cut else None
     if image is None:
         state = "empty" if not data else "cut off" if cut else "damaged, or no image"
         raise LaeError(f"{path}: cannot be decoded: the file is {state}")
@@ -94,18 +92,17 @@ class Video:
     """A video file: ``video(frame)`` decodes a frame, in any order, from any thread.
 
     Seeking in a video is inexact in many containers, so frames are counted by decoding: going
-    forward decodes what is between, and going back starts again.
+    forward decodes what is between, and going back starts again. So are all frames at first, since
+    headers are often wrong.
 
     Attributes:
         fps: frames per second, exact; None where the file does not say.
+
+    Raises:
+        LaeError: if the file is missing or holds no frames that can be decoded.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a video and count its frames by decoding them, since headers are often wrong.
-
-        Raises:
-            LaeError: if the file is missing or holds no frames that can be decoded.
-        """
         self._path = path
         self._lock = threading.Lock()
         self._restart()
@@ -158,8 +155,12 @@ class Buffered:
 
     A frame that is not held is decoded together with the frames after it, in a few threads, before
     the call returns. Nothing runs between calls: a thread that decoded in the background would
-    take time from the tracker that is being timed. Frames before the one asked for are dropped.
-    Each call returns its own copy, so a tracker may draw into it.
+    take time from the tracker that is being timed.
+
+    Args:
+        read: decodes a frame; called from several threads.
+        length: number of frames.
+        size, max_bytes: bounds of what is held, but at least one frame.
     """
 
     def __init__(
@@ -169,17 +170,8 @@ class Buffered:
         size: int = 16,
         max_bytes: int = 256 << 20,
     ) -> None:
-        """Hold at most ``size`` frames and ``max_bytes`` bytes, but at least one frame.
-
-        Args:
-            read: decodes a frame; called from several threads.
-            length: number of frames.
-            size, max_bytes: bounds of what is held.
-        """
-        self._read = read
-        self._length = length
-        self._size = size
-        self._max_bytes = max_bytes
+        self._read, self._length = read, length
+        self._size, self._max_bytes = size, max_bytes
         self._held: dict[int, Image | Exception] = {}
 
     def __call__(self, frame: int) -> Image:
@@ -188,16 +180,12 @@ class Buffered:
         Raises:
             Exception: what ``read`` raised for this frame; a block's other frames are unharmed.
         """
-        if frame in self._held:
-            self._held = {held: image for held, image in self._held.items() if held >= frame}
-        else:
-            self._held = {}
-            first = self._held[frame] = self._read(frame)
+        if frame not in self._held:
+            first = self._read(frame)
             count = min(self._size, self._max_bytes // max(first.nbytes, 1), self._length - frame)
-            if count > 1:
-                ahead = range(frame + 1, frame + count)
-                with ThreadPoolExecutor(min(_THREADS, len(ahead))) as pool:
-                    self._held.update(zip(ahead, pool.map(self._attempt, ahead)))
+            ahead = range(frame + 1, frame + count)
+            with ThreadPoolExecutor(_THREADS) as pool:
+                self._held = {frame: first, **dict(zip(ahead, pool.map(self._attempt, ahead)))}
         image = self._held[frame]
         if isinstance(image, Exception):
             raise image
