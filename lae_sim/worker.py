@@ -7,14 +7,14 @@ import json
 import mmap
 import os
 import re
-import select
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,14 +28,9 @@ from lae_sim.trackers.stopwatch import THREAD_VARIABLES, Stopwatch
 SERVE = Path(__file__).with_name("trackers") / "serve.py"
 """The script of the process."""
 
-GLANCE_S = 0.25
-"""How often a process at work is looked at, in seconds."""
-
-LAST_WORDS = 10_000
-"""How many bytes of what a process printed are kept, to say why it crashed."""
-
-CLOSE_S = 2.0
-"""How long a tracker may take to close, and its process to exit, in seconds."""
+GLANCE_S = 0.25  # how often a process at work is looked at
+LAST_WORDS = 10_000  # bytes of what a process printed, kept to say why it crashed
+CLOSE_S = 2.0  # how long a tracker may take to close, and its process to exit
 
 
 class _Asked(contextlib.AbstractContextManager[Any]):
@@ -104,7 +99,7 @@ class Worker(_Asked):
         self._python = python or sys.executable
         self._timeout, self._setup_timeout = timeout, setup_timeout
         self._process: subprocess.Popen[bytes] | None = None
-        self._control: socket.socket
+        self._control: Connection
         self._memory: mmap.mmap | bytes = b""
         self._said = b""
         self._files = contextlib.ExitStack()
@@ -132,10 +127,7 @@ class Worker(_Asked):
 
     def _start(self) -> None:
         self._kill()
-        ours, theirs = socket.socketpair()
-        self._control = ours
-        self._poll = select.poll()
-        self._poll.register(ours, select.POLLIN)
+        self._control, theirs = Pipe()
         limits = {name: str(self._threads) for name in THREAD_VARIABLES if self._threads}
         with theirs:
             inherited = theirs.fileno(), self._frames.fileno()
@@ -150,14 +142,13 @@ class Worker(_Asked):
                     start_new_session=True,  # Ctrl-C is for this process alone
                 )
             except OSError as error:
-                ours.close()
+                self._control.close()
                 raise LaeError(f"{self._python} does not start: {error.strerror}") from error
         try:
             self.sets_search = self._exchange("setup", self._setup_timeout, self._setup)
         except TrackerFailure as error:
-            hint = ""
-            if self._process is None and self._python != sys.executable:  # it gave no answer
-                hint = f" ({self._python} must be Python 3.8 or newer with NumPy)"
+            silent = self._process is None and self._python != sys.executable
+            hint = f" ({self._python} must be Python 3.8 or newer with NumPy)" if silent else ""
             self._kill()
             raise LaeError(f"{error}{hint}") from None
 
@@ -179,11 +170,10 @@ class Worker(_Asked):
         return frame.shape
 
     def _exchange(self, do: str, limit: float, question: Mapping[str, Any]) -> Any:
-        line = json.dumps({"do": do, **question}).encode() + b"\n"
         try:
             with contextlib.suppress(ConnectionError):  # the death is found where answers are read
-                self._control.sendall(line)
-            answer = json.loads(self._line(do, limit))
+                self._control.send_bytes(json.dumps({"do": do, **question}).encode())
+            answer = json.loads(self._received(do, limit))
         except BaseException:  # with Ctrl-C too: the answer would be taken for that of the next
             self._kill()
             raise
@@ -192,26 +182,21 @@ class Worker(_Asked):
             raise TrackerFailure(f"{self._tracker}: {do}: {answer['error']}")
         return answer["answer"]
 
-    def _line(self, do: str, limit: float) -> bytes:
-        """The next line of the process; it says why if there is none."""
+    def _received(self, do: str, limit: float) -> bytes:
+        """The process's answer; it says why if there is none."""
         assert self._process is not None
         self._said = b""
-        line, deadline = b"", time.monotonic() + limit
-        while not line.endswith(b"\n"):
-            left = deadline - time.monotonic()
-            if left <= 0:
+        deadline = time.monotonic() + limit
+        while not self._control.poll(max(0, min(GLANCE_S, deadline - time.monotonic()))):
+            self._pass_on()
+            if self._process.poll() is not None:  # a child of the tracker holds the pipe open
+                break
+            if time.monotonic() >= deadline:
                 raise TrackerFailure(f"{self._tracker}: {do} exceeded {limit:g} s")
-            if self._poll.poll(1000 * min(left, GLANCE_S)):
-                part = b""
-                with contextlib.suppress(ConnectionError):  # it died with a question unread
-                    part = self._control.recv(65536)
-                line, dead = line + part, not part
-            else:  # a child of the tracker may hold the socket open
-                dead = self._process.poll() is not None
-                self._pass_on()
-            if dead:
-                raise TrackerFailure(f"{self._tracker}: {do}: {self._cause()}")
-        return line
+        else:
+            with contextlib.suppress(EOFError, ConnectionError):
+                return self._control.recv_bytes()
+        raise TrackerFailure(f"{self._tracker}: {do}: {self._cause()}")
 
     def _cause(self) -> str:
         """How the process ended, and its last words."""

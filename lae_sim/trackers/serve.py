@@ -1,8 +1,8 @@
-"""The worker process: a tracker and its stopwatch, asked through a socket.
+"""The worker process: a tracker and its stopwatch, asked through a pipe.
 
 `lae_sim.worker.Worker` runs this file as a script, on the tracker's interpreter, with two inherited
-file descriptors: a socket, and the memory that frames are handed over in. Each question and each
-answer is a line of JSON. Whatever the tracker prints goes to the standard error.
+file descriptors: a pipe, and the memory that frames are handed over in. Questions and answers are
+JSON. Whatever the tracker prints goes to the standard error.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import json
 import mmap
 import os
 import signal
-import socket
 import sys
+from multiprocessing.connection import Connection
 from typing import Any
 
 FOLDER = os.path.dirname(os.path.abspath(__file__))
 
 
 def main() -> None:
-    """Answer questions until the socket is closed."""
+    """Answer questions until the pipe is closed."""
     control, frames = (int(argument) for argument in sys.argv[1:])
     for inherited in (control, frames):
         os.set_inheritable(inherited, False)  # not for the tracker's own child processes
@@ -31,11 +31,11 @@ def main() -> None:
     faulthandler.enable()  # a crash says where
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # as on a terminal
-    asked = socket.socket(fileno=control)
-    serve = Server(frames)
-    for line in asked.makefile("rb"):
-        answer = json.dumps(serve.answer(json.loads(line)))
-        asked.sendall(answer.encode() + b"\n")
+    asked, server = Connection(control), Server(frames)
+    with contextlib.suppress(EOFError):
+        while True:
+            answer = server.answer(json.loads(asked.recv_bytes()))
+            asked.send_bytes(json.dumps(answer).encode())
 
 
 class Server:
@@ -78,7 +78,7 @@ class Server:
 def _die_with_parent() -> None:
     """Have the kernel end this process with its parent, even while a tracker hangs (Linux).
 
-    Elsewhere the end of the socket does it, as soon as the tracker returns.
+    Elsewhere the end of the pipe does it, as soon as the tracker returns.
     """
     if sys.platform.startswith("linux"):
         with contextlib.suppress(ImportError):  # an interpreter built without ctypes
