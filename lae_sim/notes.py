@@ -11,7 +11,7 @@ from lae_sim.metadata import Metadata
 from lae_sim.metrics import Convention
 from lae_sim.run import Run
 
-TRUSTED_DISAGREEMENT = 0.1
+TRUSTED_DISAGREEMENT = 0.05
 
 
 class SkippedStalls:
