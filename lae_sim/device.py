@@ -17,7 +17,6 @@ from lae_sim.sensors import (
     Facts,
     gathered,
     matched,
-    memory_bytes,
     nvidia_smi,
     output,
     tegra,
@@ -34,11 +33,12 @@ def describe_device(root: str | os.PathLike[str] = "/") -> Facts:
             core, the affinity of this process, the interpreter) is that of the running system.
     """
     at = Path(root)
+    memory = r"^MemTotal:\s+(\d+) kB"
     release = r"^# R(\d+) \(release\), REVISION: ([\d.]+)"
     return gathered(
         model=lambda: _model(at),
         cpu=lambda: _cpu(at),
-        memory_bytes=lambda: memory_bytes(at, "MemTotal"),
+        memory_bytes=lambda: 1024 * int(matched(text(at / "proc/meminfo"), memory) or 0) or None,
         gpu=lambda: _gpu(at),
         power_mode=lambda: _power_mode(at),
         os=lambda: _os(at),

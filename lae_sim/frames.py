@@ -205,7 +205,6 @@ def _exact_rate(capture: Any) -> Fraction | None:
     rate = float(capture.get(cv2.CAP_PROP_FPS))
     if not 0 < rate < 10_000:
         return None
-    for intended in (Fraction(round(rate)), Fraction(round(rate * 1.001) * 1000, 1001)):
-        if abs(float(intended) / rate - 1) < 2e-5:
-            return intended
-    return Fraction(rate).limit_denominator(1000)
+    usual = Fraction(round(rate)), Fraction(round(rate * 1.001) * 1000, 1001)
+    meant = [fps for fps in usual if abs(float(fps) / rate - 1) < 2e-5]
+    return meant[0] if meant else Fraction(rate).limit_denominator(1000)

@@ -1,7 +1,7 @@
-"""Clocks, temperatures and power while a tracker runs, from system files and ``nvidia-smi``.
+"""Clocks and temperatures while a tracker runs, from system files and ``nvidia-smi``.
 
 Every reader gives None, or nothing, for what it cannot find. Sources: the Linux kernel's
-documentation of cpufreq, devfreq, thermal and hwmon (ina3221); Jetson Linux Developer Guide,
+documentation of cpufreq, devfreq, thermal and hwmon; Jetson Linux Developer Guide,
 "Platform Power and Performance"; NVML, ``nvmlClocksEventReasons``.
 """
 
@@ -34,9 +34,8 @@ def readings(root: str | os.PathLike[str] = "/") -> Facts:
 
     Keys: ``time`` (UTC, ISO 8601); ``cpu_mhz`` and ``gpu_mhz``, objects with the ``highest`` clock
     now, what is ``allowed`` by power mode and cooling, and what the ``hardware`` can do;
-    ``temperatures_c`` by zone; ``power_w`` by rail; ``load`` over 1, 5, 15 minutes;
-    ``memory_available_bytes``; ``throttle_events``, counters since boot by name;
-    ``gpu_slowdowns``, a discrete GPU's own reasons.
+    ``temperatures_c`` by zone; ``load`` over 1, 5, 15 minutes; ``throttle_events``, counters since
+    boot by name; ``gpu_slowdowns``, a discrete GPU's own reasons.
 
     Args:
         root: the folder that system files are read under.
@@ -47,9 +46,7 @@ def readings(root: str | os.PathLike[str] = "/") -> Facts:
         cpu_mhz=lambda: _cpu_mhz(at),
         gpu_mhz=lambda: _devfreq_mhz(at),
         temperatures_c=lambda: _temperatures(at),
-        power_w=lambda: _rails(at),
         load=lambda: [float(word) for word in text(at / "proc/loadavg").split()[:3]],
-        memory_available_bytes=lambda: memory_bytes(at, "MemAvailable"),
         throttle_events=lambda: _throttle_events(at),
         discrete=lambda: _discrete_gpu(at),
     )
@@ -126,12 +123,6 @@ def matched(content: str | None, pattern: str) -> str | None:
     return ".".join(match.groups()) if match else None
 
 
-def memory_bytes(at: Path, name: str) -> int | None:
-    """A figure of ``/proc/meminfo``."""
-    kib = matched(text(at / "proc/meminfo"), rf"^{name}:\s+(\d+) kB")
-    return int(kib) * 1024 if kib else None
-
-
 def tegra(at: Path) -> str | None:
     """A Jetson's chip, such as ``tegra234``."""
     return matched(text(at / "proc/device-tree/compatible"), r"nvidia,(tegra\d{3})")
@@ -199,17 +190,6 @@ def _temperatures(at: Path) -> dict[str, float]:
     return dict(sorted(hottest.items()))
 
 
-def _rails(at: Path) -> dict[str, float]:
-    """Power in W by rail, from the voltages and currents of a Jetson's monitor chips."""
-    rails = {}
-    for label in sorted(at.glob("sys/class/hwmon/hwmon*/in[123]_label")):
-        milli_volt = number(label.with_name(f"in{label.name[2]}_input"))
-        milli_ampere = number(label.with_name(f"curr{label.name[2]}_input"))
-        if milli_volt is not None and milli_ampere is not None and text(label) != "NC":
-            rails[text(label)] = round(milli_volt * milli_ampere / 1e6, 3)
-    return rails
-
-
 def _throttle_events(at: Path) -> Counter[str]:
     """Counters of x86 cores and packages, and of a Jetson's low voltage and overcurrent."""
     counters: Counter[str] = Counter()
@@ -224,15 +204,14 @@ def _throttle_events(at: Path) -> Counter[str]:
 def _discrete_gpu(at: Path) -> Facts:
     if tegra(at):  # its nvidia-smi knows none of these
         return {}
-    fields = ("clocks.sm", "clocks.max.sm", "temperature.gpu", "power.draw")
+    fields = ("clocks.sm", "clocks.max.sm", "temperature.gpu")
     try:
         values = nvidia_smi(at, *fields, "clocks_event_reasons.active")
     except ValueError:  # drivers before 535
         values = nvidia_smi(at, *fields, "clocks_throttle_reasons.active")
-    clock, limit, celsius, watts, mask = values
+    clock, limit, celsius, mask = values
     return gathered(  # what it does not know is "[N/A]"
         gpu_mhz=lambda: {"highest": float(clock), "hardware": float(limit)},
         temperatures_c=lambda: {"GPU": float(celsius)},
-        power_w=lambda: {"GPU": float(watts)},
         gpu_slowdowns=lambda: [name for bit, name in _SLOWDOWNS.items() if int(mask, 16) & bit],
     )

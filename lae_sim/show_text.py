@@ -20,9 +20,7 @@ _FIGURES: dict[str, Callable[[Any], float]] = {
     "CPU clock allowed": lambda taken: taken["cpu_mhz"]["allowed"],
     "GPU clock, MHz": lambda taken: taken["gpu_mhz"]["highest"],
     "hottest zone, C": lambda taken: max(taken["temperatures_c"].values()),
-    "largest rail, W": lambda taken: max(taken["power_w"].values()),
     "load, 1 minute": lambda taken: taken["load"][0],
-    "memory free, GiB": lambda taken: taken["memory_available_bytes"] / 2**30,
 }
 
 

@@ -106,7 +106,6 @@ def test_video_frames_from_threads(tmp_path):
     [
         (30.0, Fraction(30)),
         (29.97, Fraction(30000, 1001)),
-        (23.976, Fraction(24000, 1001)),
         (59.94, Fraction(60000, 1001)),
         (25.0, Fraction(25)),
         (12.5, Fraction(25, 2)),

@@ -48,9 +48,7 @@ def reading(mhz: float, celsius: float, **more: Any) -> dict[str, Any]:
         "time": "2026-11-22T04:00:00+00:00",
         "cpu_mhz": {"highest": mhz, **MHZ},
         "temperatures_c": {"cpu": celsius - 1, "tj": celsius},
-        "power_w": {"VDD_IN": 9.5, "VDD_SOC": 1.2},
         "load": [1.25, 0.5, 0.2],
-        "memory_available_bytes": 6 * 2**30,
         **more,
     }
 
@@ -135,7 +133,6 @@ def test_everything_that_a_profile_says_is_shown(
         "failures 1: reason ValueError: no, sequence s20",
         "CPU clock, MHz 1,728 1,320 to 1,700 1,300",
         "hottest zone, C 45.0 50.0 to 69.0 66.0",
-        "largest rail, W 9.50 9.50 9.50",
         "calls 1,980 ",
         "initialisations 20 300 300 300 300 300 300 3.33",
         "1.06% of the calls take longer than the interval between frames, 33.3 ms",
@@ -260,8 +257,7 @@ ANYTHING = st.recursive(
 )  # fmt: skip
 READING = st.dictionaries(
     st.sampled_from(
-        ["cpu_mhz", "gpu_mhz", "temperatures_c", "power_w", "load", "memory_available_bytes"]
-        + ["throttle_events", "gpu_slowdowns"]
+        ["cpu_mhz", "gpu_mhz", "temperatures_c", "load"] + ["throttle_events", "gpu_slowdowns"]
     ),
     ANYTHING | st.dictionaries(st.sampled_from(["highest", "allowed"]), ANYTHING),
 )
