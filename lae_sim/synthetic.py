@@ -15,6 +15,7 @@ from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from lae_sim.boxes import Floats
 from lae_sim.errors import LaeError
@@ -22,13 +23,13 @@ from lae_sim.frames import Dataset, Image, ImageSequence
 from lae_sim.textures import TILE, ground, sprite, tree
 
 _SIZE = np.array([640.0, 360.0])
-_CENTRE = (_SIZE - 1) / 2
+_CENTRE = complex(*(_SIZE - 1) / 2)
 _MARGIN = 700  # the ground is repeated so far beyond its tile; reaches any corner of the image
 _EXPOSURES = 4  # moments averaged over an exposure
 _OUTLINE = np.linspace(0, 2 * np.pi, 128, endpoint=False)
 _NOISE = 6.0  # sensor noise, standard deviation in levels
 
-Sines = Callable[[Floats], Floats]
+Complex = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -101,39 +102,30 @@ def synthetic_dataset(seed: int = 0) -> Dataset:
 
 
 def _sequence(scene: _Scene) -> ImageSequence:
-    path = _Path(scene)
-    time = np.arange(scene.frames, dtype=np.float64)
+    path, time = _Path(scene), np.arange(float(scene.frames))
     truth = path.boxes(time)
+    area, ratio = truth[:, 2:].prod(axis=1), truth[:, 2] / truth[:, 3]
     corners = np.clip(truth[:, None, :2] + truth[:, None, 2:] * [[0], [1]], 0, _SIZE)
-    visible = (corners[:, 1] - corners[:, 0]).prod(axis=1) / truth[:, 2:].prod(axis=1)
-    attributes = _attributes(scene, path, truth, visible)
-    truth[visible < 0.25] = np.nan
-    return ImageSequence(scene.name, truth, partial(_read, scene), attributes)
-
-
-def _attributes(scene: _Scene, path: _Path, truth: Floats, visible: Floats) -> tuple[str, ...]:
-    """DTB70's names for what a scene shows."""
-    time = np.arange(scene.frames, dtype=np.float64)
-    area = truth[:, 2:].prod(axis=1)
-    ratio = truth[:, 2] / truth[:, 3] * (truth[0, 3] / truth[0, 2])
-    angle = np.unwrap(path.angle(time))
+    visible = (corners[:, 1] - corners[:, 0]).prod(axis=1) / area
     shown = {
         "Scale variation": area.max() / area.min() > 2.5,
-        "Aspect ratio variation": max(ratio.max(), 1 / ratio.min()) > 2,
+        "Aspect ratio variation": max(ratio.max() / ratio[0], ratio[0] / ratio.min()) > 2,
         "Occlusion": scene.covers > 0,
         "Deformation": scene.gait > 0,
         "Fast camera motion": scene.shake >= 3 or scene.flight > 10,
-        "In-plane rotation": np.ptp(angle) > np.pi / 2,
+        "In-plane rotation": np.ptp(np.unwrap(np.angle(path.heading(time)))) > np.pi / 2,
         "Out-of-view": visible.min() < 0.5,
         "Background clutter": scene.clutter > 0,
         "Similar objects around": scene.rivals > 0,
         "Motion blur": scene.exposure > 0,
     }
-    return tuple(name for name, holds in shown.items() if holds)
+    truth[visible < 0.25] = np.nan
+    attributes = tuple(name for name, holds in shown.items() if holds)
+    return ImageSequence(scene.name, truth, partial(_read, scene), attributes)
 
 
 class _Path:
-    """Where everything is at any times; arrays are [n, ...] for n times."""
+    """Where everything is at any times [n]: places x + iy, turns and scales, all complex [n]."""
 
     def __init__(self, scene: _Scene) -> None:
         rng = _rng(scene, "path")
@@ -144,72 +136,57 @@ class _Path:
         middle = rng.choice([0, np.pi], (2, 1)) + rng.uniform(-0.5, 0.5, (2, 2))
         self._across = _sines(rates, reach, middle)
         rates = rng.uniform(0.2, 0.6, (2, 5))
-        self._shake = _sines(rates, scene.shake * np.sqrt(0.2) / rates, _phases(rng, 2, 5))
-        heading = rng.uniform(0, 2 * np.pi)
-        self._flight = scene.flight * np.array([np.cos(heading), np.sin(heading)])
-        self._start = rng.uniform(0, TILE, 2)
-        rates = rng.uniform(0.02, 0.05, (2, 2))
-        self._drift = _sines(rates, np.full((2, 2), 25.0), _phases(rng, 2, 2))
-        self._zoom, self._spin, self._yaw = (
-            _slow(rng, amplitude) for amplitude in (scene.zoom, scene.spin, 0.1)
-        )
+        self._shake = _sines(rates, scene.shake * np.sqrt(0.2) / rates, _phases(rng, 5))
+        self._start = rng.uniform(0, TILE) + 1j * rng.uniform(0, TILE)
+        self._flight = scene.flight * np.exp(2j * np.pi * rng.uniform())
+        views = np.array([[scene.zoom], [scene.spin]]) * [0.65, 0.35]
+        self._view = _sines(rng.uniform(0.02, 0.06, (2, 2)), views, _phases(rng, 2))
+        around = scene.size * np.array([[1.5, 0.8], [1.2, 0.8]])
         self._rivals = [
-            _sines(
-                rng.uniform(0.035, 0.09, (2, 2)),
-                scene.size * np.array([[1.5, 0.8], [1.2, 0.8]]),
-                _phases(rng, 2, 2),
-            )
+            _sines(rng.uniform(0.035, 0.09, (2, 2)), around, _phases(rng, 2))
             for _ in range(scene.rivals)
         ]
         # A tree stands where the target is fastest over the ground: it must come out again.
         time = np.arange(0.2 * scene.frames, scene.frames - 10)
-        speed = np.hypot(*(self.on_ground(time + 1) - self.on_ground(time)).T)
+        speed = np.abs(self.on_ground(time + 1) - self.on_ground(time))
         parts = np.array_split(np.arange(len(time)), max(scene.covers, 1))[: scene.covers]
-        under = time[[part[np.argmax(speed[part])] for part in parts]]
-        self.covers = self.on_ground(under)
+        self.covers = self.on_ground(time[[part[np.argmax(speed[part])] for part in parts]])
         self.crowns = scene.size * rng.uniform(1.2, 1.8, scene.covers)
 
-    def camera(self, time: Floats) -> tuple[Floats, Floats, Floats]:
-        """Ground to image: matrices [n, 2, 2], the ground's point [n, 2] at the image's [n, 2]."""
-        angle = self._spin(time)
-        matrix = np.exp(self._zoom(time))[:, None, None] * _rotation(angle)
-        there = self._start + self._flight * time[:, None] + self._drift(time)
-        return matrix, there, _CENTRE + self._shake(time)
+    def camera(self, time: Floats) -> tuple[Complex, Complex, Complex]:
+        """Ground to image: scale and turn, and the ground's point that is at the image's."""
+        there = self._start + self._flight * time
+        return np.exp(self._view(time)), there, _CENTRE + self._shake(time)
 
-    def on_ground(self, time: Floats, rival: int | None = None) -> Floats:
-        """The target's, or a rival's, place on the ground, [n, 2]."""
-        matrix, there, _ = self.camera(time)
-        across = self._across(time)
+    def on_ground(self, time: Floats) -> Complex:
+        """The target's place on the ground."""
+        turn, there, _ = self.camera(time)
+        return there + self._across(time) / turn
+
+    def heading(self, time: Floats) -> Complex:
+        """The direction in the image in which the target moves over the ground; its scale."""
+        ahead = self.on_ground(time + 3) - self.on_ground(time - 3)
+        return np.exp(self._view(time)) * ahead / np.abs(ahead)
+
+    def target(self, time: Floats, rival: int | None = None) -> tuple[Floats, Complex]:
+        """Target, or a rival, to image: matrices [n, 2, 2], and its middle in the image."""
+        place = self.camera(time)[2] + self._across(time)
         if rival is not None:
-            across = across + self._rivals[rival](time)
-        return np.asarray(there + np.einsum("nij,nj->ni", np.linalg.inv(matrix), across), float)
-
-    def angle(self, time: Floats) -> Floats:
-        """The direction in the image in which the target moves over the ground."""
-        ahead, behind = self.on_ground(time + 3), self.on_ground(time - 3)
-        x, y = (ahead - behind).T
-        return np.asarray(np.arctan2(y, x) + self._spin(time) + self._yaw(time), np.float64)
-
-    def target(self, time: Floats, rival: int | None = None) -> tuple[Floats, Floats]:
-        """Target to image: matrices [n, 2, 2], and its middle in the image [n, 2]."""
-        matrix, there, here = self.camera(time)
-        place = here + np.einsum("nij,nj->ni", matrix, self.on_ground(time, rival) - there)
+            place = place + self._rivals[rival](time)
         phase = 0.55 * time + 2.0 * (rival or 0)
         shape = np.tile(np.eye(2), (len(time), 1, 1))
         shape[:, 0, 0] += 0.5 * self.scene.gait * np.sin(phase)
         shape[:, 0, 1] += self.scene.gait * np.sin(phase + 1)
-        zoom = np.exp(self._zoom(time))[:, None, None]
-        return zoom * _rotation(self.angle(time)) @ shape, place
+        return _matrices(self.heading(time)) @ shape, place
 
     def boxes(self, time: Floats) -> Floats:
         """The boxes ``x, y, w, h`` around the target's outline, [n, 4]."""
         matrix, place = self.target(time)
         x, y = np.cos(_OUTLINE), np.sin(_OUTLINE)
-        radius = (np.abs(x) ** self.scene.corner + np.abs(y) ** self.scene.corner) ** (
-            -1 / self.scene.corner
-        )
+        corner = self.scene.corner
+        radius = (np.abs(x) ** corner + np.abs(y) ** corner) ** (-1 / corner)
         half = np.array([1, self.scene.aspect])[:, None] * self.scene.size / 2
-        outline = matrix @ (half * radius * np.stack([x, y])) + place[..., None]
+        outline = matrix @ (half * radius * np.stack([x, y])) + _points(place)[..., None]
         least, most = outline.min(axis=2), outline.max(axis=2)
         return np.concatenate([least + 0.5, most - least], axis=1)  # pixel 0 covers 0 to 1
 
@@ -235,23 +212,23 @@ class _Film:
         self._ground = np.pad(tile, [(_MARGIN, _MARGIN), (_MARGIN, _MARGIN), (0, 0)], "wrap")
         noise = rng.normal(32, _NOISE, (540, 960, 3))
         self._noise = np.clip(noise, 0, 64).astype(np.uint8)
-        matrix, there, here = path.camera(time)
-        inverse = np.linalg.inv(matrix)
-        corner = there % TILE + _MARGIN - np.einsum("nij,nj->ni", inverse, here)
-        self._views = np.concatenate([inverse, corner[..., None]], axis=2)
+        turn, there, here = path.camera(time)
+        corner = _points(there) % TILE + _MARGIN - _points(here / turn)
+        self._views = np.concatenate([_matrices(1 / turn), corner[..., None]], axis=2)
         self._layers: list[_Layer] = []
         pattern, size = rng.integers(1 << 32), (scene.size, scene.size * scene.aspect)
         for number in [*range(scene.rivals), None]:
             colour = np.array(scene.colour) + (0 if number is None else rng.normal(0, 12, 3))
             body = sprite(np.random.default_rng(pattern), size, scene.corner, colour)
             shadow = np.asarray(body * [0, 0, 0, 0.45], np.uint8)
-            moved, place = path.target(time, number)
-            below = place + 0.06 * scene.size * moved.sum(axis=2)
-            self._layers += [_Layer(shadow, moved, below), _Layer(body, moved, place)]
+            matrix, place = path.target(time, number)
+            below = _points(place) + 0.06 * scene.size * matrix.sum(axis=2)
+            self._layers.append(_Layer(shadow, matrix, below))
+            self._layers.append(_Layer(body, matrix, _points(place)))
         for where, width in zip(path.covers, path.crowns):
-            crown = tree(rng, 160)
-            place = here + np.einsum("nij,nj->ni", matrix, where - there)
-            self._layers.append(_Layer(crown, matrix * width / (0.8 * len(crown)), place))
+            crown, place = tree(rng, 160), here + turn * (where - there)
+            scale = width / (0.8 * len(crown))
+            self._layers.append(_Layer(crown, _matrices(scale * turn), _points(place)))
 
     def draw(self, frame: int) -> Image:
         """A frame, uint8 [360, 640, 3]."""
@@ -311,22 +288,25 @@ def _rng(scene: _Scene, use: str) -> np.random.Generator:
     return np.random.default_rng([scene.seed, *f"{scene.name} {use}".encode()])
 
 
-def _sines(rates: Floats, amplitudes: Floats, phases: Floats) -> Sines:
-    """Sums of sines over the last axis: times [n] to values [n, ...]."""
-    rank = (slice(None), *[None] * rates.ndim)
-    return lambda time: (amplitudes * np.sin(rates * time[rank] + phases)).sum(axis=-1)
+def _sines(rates: Floats, amplitudes: Floats, phases: Floats) -> Callable[[Floats], Complex]:
+    """Sums of sines, of the real and of the imaginary part: arrays are [2, any]."""
+
+    def at(time: Floats) -> Complex:
+        x, y = (amplitudes * np.sin(rates * time[:, None, None] + phases)).sum(axis=2).T
+        return np.asarray(x + 1j * y)
+
+    return at
 
 
-def _phases(rng: np.random.Generator, *shape: int) -> Floats:
-    return rng.uniform(0, 2 * np.pi, shape)
+def _phases(rng: np.random.Generator, count: int) -> Floats:
+    return rng.uniform(0, 2 * np.pi, (2, count))
 
 
-def _slow(rng: np.random.Generator, amplitude: float) -> Sines:
-    """A slow change of a number."""
-    return _sines(rng.uniform(0.02, 0.06, 2), np.array([0.65, 0.35]) * amplitude, _phases(rng, 2))
+def _points(places: Complex) -> Floats:
+    """Complex numbers [n] as points [n, 2]."""
+    return np.stack([places.real, places.imag], axis=-1)
 
 
-def _rotation(angle: Floats) -> Floats:
-    """Rotation matrices [n, 2, 2]."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([cosine, -sine], -1), np.stack([sine, cosine], -1)], -2)
+def _matrices(turns: Complex) -> Floats:
+    """Multiplications by complex numbers [n] as matrices [n, 2, 2]."""
+    return np.stack([_points(turns), _points(1j * turns)], axis=-1)
