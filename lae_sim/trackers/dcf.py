@@ -18,20 +18,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from lae_sim.errors import LaeError
 from lae_sim.trackers.inputs import checked_box, checked_frame
+from lae_sim.trackers.patches import CELL, crop, features
 from lae_sim.trackers.protocol import Image
 
 Array = npt.NDArray[Any]
 
-CELL = 4  # pixels
 CELLS = 32  # of the search window, whose side is CELL * CELLS pixels whatever the target's size
-ORDERS = 3  # of the Fourier series of a gradient histogram
-BINS = 2 * ORDERS + 1
 SCALE_SIDE = 32  # pixels of a patch of the scale filter
 SMALLEST = 32.0  # side of the search window, pixels of the frame
 
@@ -132,7 +129,8 @@ class Dcf:
         if not self._started:
             raise LaeError("dcf: init must come before track")
         self._keep_inside(frame)
-        shift, psr = _peak(self._response(self._channels(frame)))
+        response = (self._filter.conj() * self._channels(frame)).sum(0)
+        shift, psr = _peak(response.cpu().numpy() if self._torch else response)
         if psr >= self._min_psr * self._mean_psr:
             self._mean_psr += PSR_RATE * (psr - self._mean_psr) if self._mean_psr else psr
             self._centre += shift * self._side() / CELLS
@@ -165,17 +163,12 @@ class Dcf:
     def _channels(self, frame: Image) -> Any:
         """Fourier transform of the search window's channels, complex64 [C, CELLS, CELLS/2 + 1]."""
         side = self._side()
-        found = _features(_crop(frame, self._centre, (side, side), CELLS * CELL))
+        found = features(crop(frame, self._centre, (side, side), CELLS * CELL))
         found -= found.mean((1, 2), keepdims=True)
         return self._fft.rfft2(self._to(found * self._window))
 
-    def _response(self, x: Any) -> Array:
-        """Fourier transform of the filter's response, complex64 [CELLS, CELLS/2 + 1]."""
-        response = (self._filter.conj() * x).sum(0)
-        return response.cpu().numpy() if self._torch else response
-
     def _learn(self, frame: Image) -> None:
-        """Bring the filters up to date.
+        """Bring the filter up to date.
 
         The filter g minimises, summed over the frequencies of the search window,
 
@@ -205,13 +198,15 @@ class Dcf:
 
     def _scale_features(self, frame: Image) -> Array:
         """Fourier transform over the scales of the target's features, complex64 [S/2 + 1, F]."""
-        patches = [_crop(frame, self._centre, self._size * s, SCALE_SIDE) for s in self._steps]
-        found = _features(np.concatenate(patches))  # one call, since each has a cost of its own
+        patches = [crop(frame, self._centre, self._size * s, SCALE_SIDE) for s in self._steps]
+        found = features(np.concatenate(patches))  # one call, since each has a cost of its own
         rows = found.reshape(len(found), len(patches), -1).swapaxes(0, 1).reshape(len(patches), -1)
         return np.fft.rfft(rows * self._scale_window, axis=0).astype(np.complex64)
 
     def _rescale(self, frame: Image) -> None:
-        """Multiply the size by the scale that responds most ([5], Eqs. 5 and 6), and learn."""
+        """Multiply the size by the scale that responds most ([5]), and learn."""
+        if len(self._steps) == 1:
+            return
         z = self._scale_features(frame)
         found = 0.0
         if self._started:
@@ -246,65 +241,6 @@ def _torch(device: str) -> tuple[Any, Any]:
         reason = str(error).splitlines()[0]
         raise LaeError(f"dcf: the device {device!r} cannot be used: {reason}") from error
     return torch, found
-
-
-def _crop(frame: Image, centre: Array, size: Sequence[float], side: int) -> Image:
-    """What the box shows, as uint8 [side, side, 3]; beyond the image its edge is repeated."""
-    # warpAffine does not average: a small picture of a large box is made from a larger one
-    finer = int(np.clip(np.ceil(max(size) / side / 1.5), 1, 4))
-    pixels = side * finer
-    sx, sy = pixels / size[0], pixels / size[1]
-    left, top = centre[0] - size[0] / 2, centre[1] - size[1] / 2
-    # the centres of the first pixels coincide
-    matrix = np.array([[sx, 0, sx * (0.5 - left) - 0.5], [0, sy, sy * (0.5 - top) - 0.5]])
-    patch = cv2.warpAffine(frame, matrix, (pixels, pixels), borderMode=cv2.BORDER_REPLICATE)
-    if finer > 1:
-        patch = cv2.resize(patch, (side, side), interpolation=cv2.INTER_AREA)
-    return np.asarray(patch, np.uint8)
-
-
-def _features(patch: Image) -> Array:
-    """Gradient histograms and mean colours of the cells, float32 [BINS + 3, H/CELL, W/CELL].
-
-    A histogram of orientations is summed as its Fourier series (Liu et al., Rotation-Invariant HOG
-    Descriptors Using Fourier Analysis in Polar and Spherical Coordinates, IJCV 2014): that takes no
-    arctangent and no binning of pixels. It is then normalised and clipped (Dalal and Triggs,
-    Histograms of Oriented Gradients for Human Detection, CVPR 2005).
-    """
-    cells = (patch.shape[1] // CELL, patch.shape[0] // CELL)
-    lab = cv2.cvtColor(patch, cv2.COLOR_BGR2LAB)
-    grey = np.ascontiguousarray(lab[..., 0])
-    dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)
-    dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1)
-    magnitude = np.sqrt(dx * dx + dy * dy)  # cv2.magnitude depends on the alignment of memory
-    # magnitude * (cos, sin) of 2 k angle, for opposite gradients are one orientation
-    terms = [magnitude]
-    inverse = 1.0 / (magnitude + 1e-6)
-    cos, sin = (dx * dx - dy * dy) * inverse, 2.0 * dx * dy * inverse
-    twice = 2.0 * cos * inverse
-    before = magnitude, np.zeros_like(magnitude)
-    for _ in range(ORDERS):
-        terms += [cos, sin]
-        before, (cos, sin) = (cos, sin), (twice * cos - before[0], twice * sin - before[1])
-    series = np.stack([cv2.resize(t, cells, interpolation=cv2.INTER_AREA) for t in terms])
-    histogram = np.maximum(_SERIES_TO_BINS @ series.reshape(len(series), -1), 0.0)
-    histogram = histogram.reshape(BINS, cells[1], cells[0])
-    energy = cv2.blur((histogram**2).sum(0), (3, 3))
-    histogram = np.minimum(histogram / np.sqrt(energy + 0.5), 0.4)
-    colour = cv2.resize(lab, cells, interpolation=cv2.INTER_AREA).transpose(2, 0, 1) / 255.0 - 0.5
-    return np.concatenate([histogram, 2.0 * colour]).astype(np.float32)
-
-
-def _series_to_bins() -> Array:
-    """The values of the series at the bins' orientations, smoothed as if bins were triangles."""
-    order = np.arange(1, ORDERS + 1)[:, None]
-    angle = 2 * order * np.arange(BINS) * np.pi / BINS
-    weight = 2 * np.sinc(order / BINS) ** 2
-    waves = np.stack([weight * np.cos(angle), weight * np.sin(angle)], 1).reshape(-1, BINS)
-    return np.concatenate([np.ones((1, BINS)), waves]).T.astype(np.float32) / BINS
-
-
-_SERIES_TO_BINS = _series_to_bins()
 
 
 def _gaussian(count: int, sigma: float) -> Array:

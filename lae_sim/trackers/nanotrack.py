@@ -101,13 +101,13 @@ class NanoTrack:
         if not self._started:
             raise LaeError("nanotrack: init must come before track")
         edge = np.array(frame.shape[1::-1], float)
-        self._centre, self._size = self._inside(self._centre, edge), np.minimum(self._size, edge)
+        self._centre, self._size = np.clip(self._centre, 0, edge), np.minimum(self._size, edge)
         zoom = TEMPLATE / self._context_side()
         patch = self._crop(frame, round(SEARCH / zoom), SEARCH)
         scores, sides = self._correlate(patch)
         left, top, right, bottom = sides.astype(np.float64)
         width, height = np.maximum(left + right, 1e-3), np.maximum(top + bottom, 1e-3)
-        # SiamRPN, Eq. 14: against changes of shape and of size, both larger than 1
+        # the penalty of SiamRPN on changes of shape and of size
         w, h = self._size * zoom
         shape, size = (width / height) / (w / h), _overall(width, height) / _overall(w, h)
         change = np.maximum(shape, 1 / shape) * np.maximum(size, 1 / size)
@@ -123,7 +123,7 @@ class NanoTrack:
         )
         rate = penalty[best] * scores[best] * self._rate
         found = np.array([width[best], height[best]]) / zoom
-        self._centre = self._inside(self._centre + offset / zoom, edge)
+        self._centre = np.clip(self._centre + offset / zoom, 0, edge)
         size = (1 - rate) * self._size + rate * found
         self._size = np.clip(size, SMALLEST, np.maximum(edge, SMALLEST))
         (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
@@ -143,11 +143,8 @@ class NanoTrack:
             "weights_digest": self._digest,
         }
 
-    def _inside(self, centre: npt.NDArray[Any], edge: npt.NDArray[Any]) -> Any:
-        return np.clip(centre, 0.0, edge)
-
     def _context_side(self) -> float:
-        """Side of the square around the target with its context, pixels (SiamRPN++, 4.1)."""
+        """Side of the square around the target with its context, pixels."""
         return float(_overall(*self._size.tolist()))
 
     def _crop(self, frame: Image, side: int, pixels: int) -> Image:
@@ -176,7 +173,7 @@ class NanoTrack:
 
 
 def _overall(w: Any, h: Any) -> Any:
-    """Side of the square of a target's size and its context (SiamRPN, Eq. 15)."""
+    """Side of the square of a target's size and its context (SiamRPN)."""
     pad = (w + h) * CONTEXT
     return np.sqrt((w + pad) * (h + pad))
 
