@@ -53,7 +53,7 @@ _CLIP_FIRST = {"bird1_2": 775, "bird1_3": 1573, "uav1_3": 2473}
 
 def find_dataset(
     name: str | None = None,
-    root: Path | None = None,
+    root: str | Path | None = None,
     sequences: Sequence[str] | None = None,
     box: Sequence[float] | None = None,
     fps: Fraction | None = None,
@@ -83,6 +83,7 @@ def find_dataset(
         made = {sequence.name: sequence for sequence in synthetic_dataset().sequences}
         chosen = _choose(sequences, made, "the synthetic dataset")
         return Dataset("synthetic", fps or Fraction(30), [made[name] for name in chosen])
+    root = Path(root)
     if root.is_file() or box is not None:
         return _without_truth(name, root, sequences, box, fps)
     name = _SPELLINGS.get((name or "").lower(), name)

@@ -155,7 +155,8 @@ class Buffered:
 
     A frame that is not held is decoded together with the frames after it, in a few threads, before
     the call returns. Nothing runs between calls: a thread that decoded in the background would
-    take time from the tracker that is being timed.
+    take time from the tracker that is being timed. Of frames asked for at equal steps, only those
+    are decoded.
 
     Args:
         read: decodes a frame; called from several threads.
@@ -173,6 +174,7 @@ class Buffered:
         self._read, self._length = read, length
         self._size, self._max_bytes = size, max_bytes
         self._held: dict[int, Image | Exception] = {}
+        self._asked = [0, 0]  # the last two
 
     def __call__(self, frame: int) -> Image:
         """The frame, uint8 [H, W, 3].
@@ -180,10 +182,13 @@ class Buffered:
         Raises:
             Exception: what ``read`` raised for this frame; a block's other frames are unharmed.
         """
+        before, last = self._asked
+        self._asked = [last, frame]
         if frame not in self._held:
             first = self._read(frame)
-            count = min(self._size, self._max_bytes // max(first.nbytes, 1), self._length - frame)
-            ahead = range(frame + 1, frame + count)
+            step = frame - last if frame - last == last - before > 0 else 1
+            count = min(self._size, self._max_bytes // max(first.nbytes, 1))
+            ahead = range(frame + step, min(frame + step * count, self._length), step)
             with ThreadPoolExecutor(_THREADS) as pool:
                 self._held = {frame: first, **dict(zip(ahead, pool.map(self._attempt, ahead)))}
         image = self._held[frame]

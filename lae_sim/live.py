@@ -127,6 +127,7 @@ class Live:
         sequence: ImageSequence,
         tracker: TimedTracker,
         pre_forecaster: ForecasterFactory | None = None,
+        keep_size: bool = False,
         service: Service | None = None,
         include_decode: bool = False,
         progress: Callable[[int], object] = lambda frames: None,
@@ -138,6 +139,8 @@ class Live:
             tracker: a tracker with a stopwatch.
             pre_forecaster: sets the search region before each frame; needs a tracker that
                 ``sets_search``.
+            keep_size: search for the size last found at the predicted centre; otherwise for the
+                predicted size, as in Alg. 1.
             service: times of another device, by frame, instead of the measured ones.
             include_decode: count the decoding of a frame as part of its processing.
             progress: told how many more world frames are done, after each processed one.
@@ -156,6 +159,8 @@ class Live:
         self._sequence = sequence
         self._tracker = tracker
         self._pre_forecaster = pre_forecaster
+        self._keep_size = keep_size
+        self._found: Sequence[float] = box.tolist()
         self._forecaster: Forecaster | None = None
         self._service = service
         self._include_decode = include_decode
@@ -192,8 +197,13 @@ class Live:
     def _track(self, frame: int, image: Image) -> Answer:
         if self._forecaster is None:
             return self._tracker.track(image)
-        answer = self._tracker.track(image, search_of(self._forecaster.predict(frame), self._size))
+        x, y, w, h = self._forecaster.predict(frame)
+        if self._keep_size:
+            _, _, last_w, last_h = self._found
+            x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
+        answer = self._tracker.track(image, search_of([x, y, w, h], self._size))
         if answer.box is not None:
+            self._found = answer.box
             self._forecaster.update(frame, answer.box)
         return answer
 

@@ -111,6 +111,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--policy", metavar="NAME", help="real-time: which frame a free tracker takes (latest)")
     add("--pre-forecaster", metavar="NAME", help="predict the search region, such as kalman")
+    add("--keep-size", action="store_true", help="predict the centre of the search region only")
     add(
         "--timing",
         metavar="TRACE|constant:47ms",
@@ -230,8 +231,8 @@ def _tracker(arguments: argparse.Namespace) -> TimedTracker:
     from lae_sim.translation import Translated
     from lae_sim.worker import InProcess, Worker
 
-    if arguments.translate and arguments.pre_forecaster is None:
-        raise LaeError("--translate shifts frames to where a --pre-forecaster predicts the target")
+    if (arguments.translate or arguments.keep_size) and arguments.pre_forecaster is None:
+        raise LaeError("--translate and --keep-size are ways to use a --pre-forecaster")
     options = parse_options(dict(arguments.option))
     if arguments.device is not None:
         options["device"] = arguments.device
@@ -279,7 +280,9 @@ def _passes(
     if arguments.pre_forecaster is not None:
         common["pre_forecaster"] = load_forecaster(arguments.pre_forecaster)
         search = "translation" if isinstance(tracker, Translated) else "native"
+        common["keep_size"] = arguments.keep_size
         document["schedule"] = {"pre_forecaster": arguments.pre_forecaster, "search": search}
+        document["schedule"]["keep_size"] = arguments.keep_size
 
     def task(name: str, run: Callable[..., LiveRun], rounds: int = 1, **schedule: Any) -> Pass:
         path = out.with_suffix(f".{name}.parquet") if name else out

@@ -195,3 +195,21 @@ def test_buffered_frames_can_be_drawn_into():
     assert read(1)[0, 0, 0] == 1
     read(2)[:] = 99
     assert read(2)[0, 0, 0] == 2
+
+
+def test_frames_at_equal_steps_are_decoded_once_and_alone() -> None:
+    decoded: list[int] = []
+
+    def read(frame: int) -> np.ndarray:
+        decoded.append(frame)
+        return np.full((2, 2, 3), frame, np.uint8)
+
+    buffered = Buffered(read, 90, size=4)
+    for frame in range(0, 90, 3):
+        assert buffered(frame)[0, 0, 0] == frame
+    assert len(decoded) <= 30 + 2 * 4  # what was decoded before the steps were known
+    decoded.clear()
+    buffered = Buffered(read, 90, size=4)
+    for frame in range(90):
+        assert buffered(frame)[0, 0, 0] == frame
+    assert sorted(decoded) == list(range(90))

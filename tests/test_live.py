@@ -136,6 +136,21 @@ def test_the_pre_forecaster_sets_the_search_before_each_frame() -> None:
             filtered.update(frame, run.recording.boxes[frame].tolist())
 
 
+def test_the_size_of_the_search_may_be_left_to_the_tracker() -> None:
+    class Growing(ConstantVelocity):
+        def predict(self, frame: int) -> list[float]:
+            x, y, w, h = super().predict(frame)
+            return [x, y, 2 * w, 4 * h]
+
+    for keep, size in ((False, (24, 40)), (True, (12, 10))):
+        tracker = FakeTimed()
+        options = {"pre_forecaster": Growing, "keep_size": keep}
+        run_real_time(bright_sequence(PATH[:3]), tracker, CLOCK, latest, **options)
+        first = tracker.searches[0]
+        assert first is not None
+        assert first == [PATH[0][0] + 12, PATH[0][1] + 20, *size]
+
+
 def test_the_closed_loop_finds_what_the_plain_loop_loses() -> None:
     path = [(2.0 + 3 * i, 8.0) for i in range(27)]
     sequence, reach = bright_sequence(path), 7.0  # the target moves 9 pixels in 3 frames
