@@ -151,7 +151,7 @@ class _Path:
         speed = np.abs(self.on_ground(time + 1) - self.on_ground(time))
         parts = np.array_split(np.arange(len(time)), max(scene.covers, 1))[: scene.covers]
         self.covers = self.on_ground(time[[part[np.argmax(speed[part])] for part in parts]])
-        self.crowns = scene.size * rng.uniform(1.2, 1.8, scene.covers)
+        self.crowns = scene.size * rng.uniform(1.0, 1.5, scene.covers)
 
     def camera(self, time: Floats) -> tuple[Complex, Complex, Complex]:
         """Ground to image: scale and turn, and the ground's point that is at the image's."""

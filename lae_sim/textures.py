@@ -79,11 +79,13 @@ def sprite(
     u, v = x / half[0], y / half[1]
     inside = np.abs(u) ** corner + np.abs(v) ** corner
     body = np.ones((*u.shape, 3)) * np.asarray(colour, float)
-    for at in (0.42, -0.75, rng.uniform(-0.5, 0.2)):  # windows, or stripes of a coat
-        body[np.abs(u - at - 0.06 * v**2) < rng.uniform(0.06, 0.15)] = (45, 40, 35)
+    stripes = zip(rng.uniform(-0.6, 0.2, 2), (0.05, 0.03))
+    for at, width in ((0.42, 0.16), (-0.72, 0.09), *stripes):  # windows, a load
+        body[np.abs(u - at - 0.06 * v**2) < width] = (45, 40, 35)
     body[np.abs(v - rng.uniform(-0.4, 0.4)) < 0.13] *= 0.55
-    body[(np.abs(u + 0.2) < 0.2) & (np.abs(v) < 0.55)] += rng.uniform(-60, 60, 3)
-    body[(u > 0.8) & (np.abs(np.abs(v) - 0.5) < 0.2)] = (200, 235, 240)  # it heads to the right
+    body[(np.abs(u + 0.2) < 0.2) & (np.abs(v) < 0.55)] += rng.uniform(-50, 50, 3)
+    body[np.abs(v) > 0.86] *= 0.6
+    body[(u > 0.86) & (np.abs(np.abs(v) - 0.6) < 0.2)] = (200, 235, 240)  # it heads to the right
     body[inside > 0.85] *= 0.7
     body *= 0.85 + 0.3 * cv2.resize(rng.random((10, 16)), u.shape[::-1])[..., None]
     alpha = (inside <= 1)[..., None] * 255.0
