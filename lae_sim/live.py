@@ -24,7 +24,7 @@ from lae_sim.forecast import Forecaster, ForecasterFactory
 from lae_sim.frames import Image, ImageSequence
 from lae_sim.policies import every, latest
 from lae_sim.recording import Recording
-from lae_sim.timed import Answer, TimedTracker, TrackerFailure
+from lae_sim.timed import Answer, TimedTracker, TrackerError
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +178,9 @@ class Live:
         self._check(frame, image)
         try:
             answer = self._init(image) if frame == 0 else self._track(frame, image)
-        except TrackerFailure as error:
+        except TrackerError as error:
             name = self._sequence.name
-            raise TrackerFailure(f"sequence {name!r}, frame {frame}: {error}") from error
+            raise TrackerError(f"sequence {name!r}, frame {frame}: {error}") from error
         self._answers.append(answer)
         self._progress(frame - self._last)
         self._last = frame

@@ -19,7 +19,7 @@ from lae_sim.journal import Journal
 from lae_sim.latency import by_frame
 from lae_sim.live import LiveRun
 from lae_sim.metadata import FORMAT, VERSION, Metadata
-from lae_sim.timed import TimedTracker, TrackerFailure
+from lae_sim.timed import TimedTracker, TrackerError
 from lae_sim.trace import Trace, read_trace, write_trace
 
 READING_INTERVAL_S = 10.0
@@ -169,7 +169,7 @@ def run_pass(
             run = task.run(ready if buffered else sequence, progress=advance)
         except LaeError as error:
             failures.append({"sequence": sequence.name, "reason": str(error)})
-            cold = isinstance(error, TrackerFailure)
+            cold = isinstance(error, TrackerError)
         else:
             during = []
             if time.monotonic() - read_at > READING_INTERVAL_S:

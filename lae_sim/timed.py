@@ -10,7 +10,7 @@ from lae_sim.errors import LaeError
 from lae_sim.frames import Image
 
 
-class TrackerFailure(LaeError):
+class TrackerError(LaeError):
     """A tracker that raised, crashed, or took too long; it must be initialised again."""
 
 
@@ -50,7 +50,7 @@ class TimedTracker(Protocol):
                 stopwatch starts; only where ``sets_search``.
 
         Raises:
-            TrackerFailure: if the tracker raised, crashed, answered anything but a box, or took
+            TrackerError: if the tracker raised, crashed, answered anything but a box, or took
                 too long.
         """
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from lae_sim.errors import LaeError
 from lae_sim.frames import Image
-from lae_sim.timed import Answer, TrackerFailure
+from lae_sim.timed import Answer, TrackerError
 from lae_sim.trackers.stopwatch import THREAD_VARIABLES, Stopwatch
 
 SERVE = Path(__file__).with_name("trackers") / "serve.py"
@@ -54,7 +54,7 @@ class _Asked(contextlib.AbstractContextManager[Any]):
 
     def close(self) -> None:
         """End the tracker."""
-        with contextlib.suppress(TrackerFailure):
+        with contextlib.suppress(TrackerError):
             self._ask("close")
 
     def _ask(self, do: str, **question: Any) -> Any:
@@ -116,7 +116,7 @@ class Worker(_Asked):
         """End the tracker and its process."""
         try:
             if self._process is not None:
-                with contextlib.suppress(TrackerFailure, subprocess.TimeoutExpired):
+                with contextlib.suppress(TrackerError, subprocess.TimeoutExpired):
                     self._exchange("close", CLOSE_S, {})
                     self._control.close()  # on which it exits by itself
                     self._process.wait(CLOSE_S)
@@ -146,7 +146,7 @@ class Worker(_Asked):
                 raise LaeError(f"{self._python} does not start: {error.strerror}") from error
         try:
             self.sets_search = self._exchange("setup", self._setup_timeout, self._setup)
-        except TrackerFailure as error:
+        except TrackerError as error:
             silent = self._process is None and self._python != sys.executable
             hint = f" ({self._python} must be Python 3.8 or newer with NumPy)" if silent else ""
             self._kill()
@@ -154,7 +154,7 @@ class Worker(_Asked):
 
     def _ask(self, do: str, **question: Any) -> Any:
         if self._process is None and do == "track":
-            raise TrackerFailure(f"{self._tracker}: the tracker must be initialised first")
+            raise TrackerError(f"{self._tracker}: the tracker must be initialised first")
         if self._process is None or (do == "init" and self._process.poll() is not None):
             self._start()
         if "frame" in question:
@@ -179,7 +179,7 @@ class Worker(_Asked):
             raise
         self._pass_on()
         if "error" in answer:
-            raise TrackerFailure(f"{self._tracker}: {do}: {answer['error']}")
+            raise TrackerError(f"{self._tracker}: {do}: {answer['error']}")
         return answer["answer"]
 
     def _received(self, do: str, limit: float) -> bytes:
@@ -192,11 +192,11 @@ class Worker(_Asked):
             if self._process.poll() is not None:  # a child of the tracker holds the pipe open
                 break
             if time.monotonic() >= deadline:
-                raise TrackerFailure(f"{self._tracker}: {do} exceeded {limit:g} s")
+                raise TrackerError(f"{self._tracker}: {do} exceeded {limit:g} s")
         else:
             with contextlib.suppress(EOFError, ConnectionError):
                 return self._control.recv_bytes()
-        raise TrackerFailure(f"{self._tracker}: {do}: {self._cause()}")
+        raise TrackerError(f"{self._tracker}: {do}: {self._cause()}")
 
     def _cause(self) -> str:
         """How the process ended, and its last words."""
@@ -261,7 +261,7 @@ class InProcess(_Asked):
         try:
             return getattr(self._stopwatch, do)(**question)
         except LaeError as error:
-            raise TrackerFailure(f"{self._tracker}: {do}: {error}") from error
+            raise TrackerError(f"{self._tracker}: {do}: {error}") from error
 
 
 def _answer(found: dict[str, Any]) -> Answer:

@@ -23,7 +23,7 @@ from lae_sim.metadata import Metadata
 from lae_sim.policies import every, fifo, latest, shrinking_tail, vot_realtime
 from lae_sim.recording import Recording
 from lae_sim.run import Run, replay_sequence, replay_trace
-from lae_sim.timed import Answer, TrackerFailure
+from lae_sim.timed import Answer, TrackerError
 from lae_sim.trace import Trace, read_trace, write_trace
 
 CLOCK = Clock.at(Fraction(30))
@@ -230,9 +230,9 @@ def test_a_frame_that_cannot_be_used(frame: np.ndarray, message: str) -> None:
 def test_a_failing_tracker_is_not_hidden() -> None:
     class Failing(FakeTimed):
         def track(self, frame: np.ndarray, search: object = None) -> Answer:
-            raise TrackerFailure("no")
+            raise TrackerError("no")
 
-    with pytest.raises(TrackerFailure, match="no"):
+    with pytest.raises(TrackerError, match="no"):
         run_real_time(bright_sequence(PATH), Failing(), CLOCK)
 
 

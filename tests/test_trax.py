@@ -16,7 +16,7 @@ import pytest
 from conftest import REPOSITORY
 
 from lae_sim.errors import LaeError
-from lae_sim.timed import TrackerFailure
+from lae_sim.timed import TrackerError
 from lae_sim.trackers.names import make_tracker
 from lae_sim.worker import Worker
 
@@ -308,7 +308,7 @@ def test_the_watchdog_ends_a_hanging_one_with_its_program(command: Callable[[str
         worker.init(FRAME, BOX)
         program = int(worker.track(FRAME).score or 0)
         assert alive(program)
-        with pytest.raises(TrackerFailure, match=r"1\.5 s"):
+        with pytest.raises(TrackerError, match=r"1\.5 s"):
             worker.track(FRAME)
         assert dies(program)
         assert worker.init(FRAME, BOX).box == BOX

@@ -22,7 +22,7 @@ from misbehaving import ANSWERS, BOX
 
 import lae_sim.worker
 from lae_sim.errors import LaeError
-from lae_sim.timed import TimedTracker, TrackerFailure
+from lae_sim.timed import TimedTracker, TrackerError
 from lae_sim.worker import InProcess, Worker
 
 TRACKERS = sorted((REPOSITORY / "lae_sim" / "trackers").glob("*.py"))
@@ -128,7 +128,7 @@ def test_an_answer_is_a_box_or_a_failure_that_names_it(answer: str) -> None:
             assert (found.box, found.score) == GOOD[answer]
             assert all(type(v) is float for v in found.box or ())
         else:
-            with pytest.raises(TrackerFailure, match=r"track: answered .*, not a box of four") as e:
+            with pytest.raises(TrackerError, match=r"track: answered .*, not a box of four") as e:
                 tracker.track(FRAME)
             assert len(str(e.value)) < 200
 
@@ -142,7 +142,7 @@ def test_answers_are_the_same_from_a_process(start: Any, answer: str) -> None:
         assert (found.box, found.score) == GOOD[answer]
     else:
         before = pid(worker)
-        with pytest.raises(TrackerFailure, match="not a box of four finite numbers"):
+        with pytest.raises(TrackerError, match="not a box of four finite numbers"):
             worker.track(FRAME)
         assert pid(worker) == before
 
@@ -210,7 +210,7 @@ def test_set_search_and_the_first_sync_are_not_measured(start: Any) -> None:
 def test_a_tracker_without_set_search_cannot_be_told(make: Callable[..., TimedTracker]) -> None:
     tracker = make()
     tracker.init(FRAME, BOX)
-    with pytest.raises(TrackerFailure, match="no set_search"):
+    with pytest.raises(TrackerError, match="no set_search"):
         tracker.track(FRAME, search=BOX)
     tracker.close()
 
@@ -232,12 +232,12 @@ def test_a_process_that_ends_or_hangs_is_replaced(start: Any, end: str) -> None:
     worker = start(track=end, timeout=0.4)
     worker.init(FRAME, BOX)
     first, began = pid(worker), time.monotonic()
-    with pytest.raises(TrackerFailure, match=f"misbehaving:Tracker: track:? .*{ENDS[end]}"):
+    with pytest.raises(TrackerError, match=f"misbehaving:Tracker: track:? .*{ENDS[end]}"):
         worker.track(FRAME)
     assert time.monotonic() - began < 3
     assert not alive(first)
     assert not children_that_sleep("1001")
-    with pytest.raises(TrackerFailure, match="initialised first"):
+    with pytest.raises(TrackerError, match="initialised first"):
         worker.track(FRAME)
     assert worker.init(FRAME, BOX).box == BOX
     assert pid(worker) != first
@@ -247,7 +247,7 @@ def test_a_process_that_ends_or_hangs_is_replaced(start: Any, end: str) -> None:
 def test_init_may_crash_or_hang(start: Any, end: str) -> None:
     worker = start(init=end, timeout=0.4)
     for _ in range(2):
-        with pytest.raises(TrackerFailure, match=f"init:? .*{ENDS[end]}"):
+        with pytest.raises(TrackerError, match=f"init:? .*{ENDS[end]}"):
             worker.init(FRAME, BOX)
 
 
@@ -263,12 +263,12 @@ def test_an_exception_says_where_and_the_next_init_works(
 ) -> None:
     tracker = make(track=what)
     process = pid(tracker) if isinstance(tracker, Worker) else 0
-    with pytest.raises(TrackerFailure, match="initialised first"):
+    with pytest.raises(TrackerError, match="initialised first"):
         tracker.track(FRAME)
     tracker.init(FRAME, BOX)
-    with pytest.raises(TrackerFailure, match=message):
+    with pytest.raises(TrackerError, match=message):
         tracker.track(FRAME)
-    with pytest.raises(TrackerFailure, match="initialised first"):
+    with pytest.raises(TrackerError, match="initialised first"):
         tracker.track(FRAME)
     assert tracker.init(FRAME, BOX).box == BOX
     if isinstance(tracker, Worker):
@@ -283,7 +283,7 @@ def test_a_process_that_died_between_sequences_is_replaced(start: Any) -> None:
     time.sleep(0.1)
     assert worker.init(FRAME, BOX).box == BOX
     os.kill(pid(worker), signal.SIGKILL)
-    with pytest.raises(TrackerFailure, match=r"ended by SIGKILL \(out of memory\?\)"):
+    with pytest.raises(TrackerError, match=r"ended by SIGKILL \(out of memory\?\)"):
         worker.track(FRAME)
     assert worker.describe()["python"]
 
@@ -307,7 +307,7 @@ def test_a_tracker_that_cannot_be_made_says_why(
     for kind in (Worker, InProcess) if options else (InProcess,):
         with pytest.raises(LaeError, match=message) as found:
             kind(tracker, options)
-        assert not isinstance(found.value, TrackerFailure)
+        assert not isinstance(found.value, TrackerError)
 
 
 @pytest.mark.parametrize("making", ["crash", "hang_in_c"])
@@ -316,7 +316,7 @@ def test_making_a_tracker_may_crash_or_hang(making: str) -> None:
     message = ENDS[making].replace(r"0\.4", "1")
     with pytest.raises(LaeError, match=f"setup:? .*{message}") as found:
         Worker("misbehaving:Tracker", {"making": making}, setup_timeout=1)
-    assert not isinstance(found.value, TrackerFailure)
+    assert not isinstance(found.value, TrackerError)
     assert time.monotonic() - began < 5
 
 
@@ -426,7 +426,7 @@ def test_nothing_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
             worker.init(FRAME, BOX)
             try:
                 worker.track(FRAME)
-            except TrackerFailure:
+            except TrackerError:
                 worker.init(FRAME, BOX)
                 processes.append(pid(worker))
         worker.close()

@@ -19,14 +19,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lae_sim.errors import LaeError
 from lae_sim.trackers.inputs import checked_box, checked_frame
 from lae_sim.trackers.patches import CELL, crop, features
-from lae_sim.trackers.protocol import Image
-
-Array = npt.NDArray[Any]
+from lae_sim.trackers.protocol import Array, Image
 
 CELLS = 32  # of the search window, whose side is CELL * CELLS pixels whatever the target's size
 SCALE_SIDE = 32  # pixels of a patch of the scale filter

@@ -55,7 +55,7 @@ def make_tracker(name: str, options: Mapping[str, Any]) -> Tracker:
     return tracker
 
 
-def parse_options(items: Mapping[str, str]) -> "dict[str, Any]":
+def parse_options(items: Mapping[str, str]) -> dict[str, Any]:
     """Options given as text: ``3``, ``0.5`` and ``true`` become numbers and booleans."""
     return {name: _value(text) for name, text in items.items()}
 

@@ -16,11 +16,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from lae_sim.errors import LaeError
 from lae_sim.trackers.inputs import checked_box, checked_frame
-from lae_sim.trackers.protocol import Image
+from lae_sim.trackers.protocol import Array, Image
 
 TEMPLATE, SEARCH, STRIDE = 127, 255, 16  # pixels of the two inputs, and of a step of the output
 CONTEXT = 0.5
@@ -159,11 +158,11 @@ class NanoTrack:
         patch = cv2.warpAffine(frame, matrix, (pixels, pixels), borderValue=self._mean)
         return np.asarray(patch, np.uint8)
 
-    def _features(self, patch: Image) -> npt.NDArray[np.float32]:
+    def _features(self, patch: Image) -> Array:
         self._backbone.setInput(cv2.dnn.blobFromImage(patch))
         return np.asarray(self._backbone.forward(), np.float32)
 
-    def _correlate(self, patch: Image) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    def _correlate(self, patch: Image) -> tuple[Array, Array]:
         """Probability [n, n], and distances left, top, right, bottom [4, n, n], pixels of patch."""
         self._head.setInput(self._template, "input1")
         self._head.setInput(self._features(patch), "input2")

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from lae_sim.trackers.protocol import Image
-
-Array = npt.NDArray[Any]
+from lae_sim.trackers.protocol import Array, Image
 
 CELL = 4  # pixels
 ORDERS = 3  # of the Fourier series of a gradient histogram
