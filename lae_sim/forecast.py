@@ -13,7 +13,6 @@ The class itself is the factory; name it ``package.module:MyForecaster`` on the 
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Optional, Protocol, runtime_checkable
@@ -22,7 +21,7 @@ import numpy as np
 
 from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, explained
 
 ImageSize = Optional[tuple[int, int]]
 """Width and height of the images in pixels, or None if unknown."""
@@ -169,15 +168,8 @@ def forecast(
         return (
             boxes if finish is None else finish(boxes, lanes.boxes[item], lanes.image_sizes[lane])
         )
-    try:
+    with explained(name):
         return _streamed(factory, lanes, item, frame, lane, name)
-    except LaeError:
-        raise
-    except Exception as error:  # a user's forecaster may fail in any way
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        raise LaeError(
-            f"{name}: {type(error).__name__}: {error} ({last.filename}, line {last.lineno})"
-        ) from error
 
 
 def _streamed(

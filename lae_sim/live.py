@@ -19,12 +19,12 @@ import numpy as np
 from lae_sim.boxes import Floats
 from lae_sim.clock import Clock
 from lae_sim.engine import Ints, Policy, Service, simulate
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, explained
 from lae_sim.forecast import Forecaster, ForecasterFactory
 from lae_sim.frames import Image, ImageSequence
 from lae_sim.policies import every, latest
 from lae_sim.recording import Recording
-from lae_sim.timed import Answer, TimedTracker, TrackerError
+from lae_sim.timed import Answer, TimedTracker
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,12 +175,12 @@ class Live:
         before = perf_counter_ns()
         image = self._sequence.read(frame)
         decoding = perf_counter_ns() - before if self._include_decode else 0
-        self._check(frame, image)
         try:
+            self._check(frame, image)
             answer = self._init(image) if frame == 0 else self._track(frame, image)
-        except TrackerError as error:
+        except LaeError as error:
             name = self._sequence.name
-            raise TrackerError(f"sequence {name!r}, frame {frame}: {error}") from error
+            raise type(error)(f"sequence {name!r}, frame {frame}: {error}") from error
         self._answers.append(answer)
         self._progress(frame - self._last)
         self._last = frame
@@ -191,40 +191,41 @@ class Live:
     def _init(self, image: Image) -> Answer:
         box = self._sequence.truth[0].tolist()
         if self._pre_forecaster is not None:
-            self._forecaster = self._pre_forecaster(box, self._size)
+            with explained("the pre-forecaster"):
+                self._forecaster = self._pre_forecaster(box, self._size)
         return self._tracker.init(image, box)
 
     def _track(self, frame: int, image: Image) -> Answer:
         if self._forecaster is None:
             return self._tracker.track(image)
-        x, y, w, h = self._forecaster.predict(frame)
-        if self._keep_size:
-            _, _, last_w, last_h = self._found
-            x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
-        answer = self._tracker.track(image, search_of([x, y, w, h], self._size))
+        with explained("the pre-forecaster"):
+            x, y, w, h = self._forecaster.predict(frame)
+            if self._keep_size:
+                _, _, last_w, last_h = self._found
+                x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
+            search = search_of([x, y, w, h], self._size)
+        answer = self._tracker.track(image, search)
         if answer.box is not None:
             self._found = answer.box
-            self._forecaster.update(frame, answer.box)
+            with explained("the pre-forecaster"):
+                self._forecaster.update(frame, answer.box)
         return answer
 
     def _check(self, frame: int, image: Image) -> None:
-        where = f"sequence {self._sequence.name!r}, frame {frame}"
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            raise LaeError(
-                f"{where}: a frame must be uint8 [H, W, 3], not {image.dtype} {image.shape}"
-            )
+            raise LaeError(f"a frame must be uint8 [H, W, 3], not {image.dtype} {image.shape}")
         size = image.shape[1], image.shape[0]
         if frame == 0:
             self._size = size
             x, y, w, h = self._sequence.truth[0]
             if x >= size[0] or y >= size[1] or x + w <= 0 or y + h <= 0:
                 raise LaeError(
-                    f"{where}: the first box {_told(self._sequence.truth[0])} lies outside the "
+                    f"the first box {_told(self._sequence.truth[0])} lies outside the "
                     f"{size[0]}x{size[1]} image"
                 )
         elif size != self._size:
             raise LaeError(
-                f"{where}: the image is {size[0]}x{size[1]}, and the first one "
+                f"the image is {size[0]}x{size[1]}, and the first one "
                 f"{self._size[0]}x{self._size[1]}"
             )
 

@@ -247,6 +247,33 @@ def test_a_pre_forecaster_needs_search_control() -> None:
         )
 
 
+@pytest.mark.parametrize(
+    ("call", "answer", "message"),
+    [
+        ("predict", [np.nan] * 4, "'bright', frame 2: the pre-forecaster predicted nan"),
+        ("predict", [1, 2, 3], "frame 2: the pre-forecaster: ValueError"),
+        ("predict", None, "frame 2: the pre-forecaster: TypeError"),
+        ("predict", ValueError("no\nidea"), r"frame 2: the pre-forecaster: ValueError: no idea \("),
+        ("update", KeyError("u"), "frame 2: the pre-forecaster: KeyError"),
+        ("__init__", RuntimeError("r"), "frame 0: the pre-forecaster: RuntimeError"),
+    ],
+)
+def test_a_pre_forecaster_that_fails(call: str, answer: object, message: str) -> None:
+    class Failing(ConstantVelocity):
+        pass
+
+    def fail(self: object, *arguments: object) -> object:
+        if arguments[0] == 1:
+            return getattr(ConstantVelocity, call)(self, *arguments)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    setattr(Failing, call, fail)
+    with pytest.raises(LaeError, match=message):
+        run_every_frame(bright_sequence(PATH), FakeTimed(), pre_forecaster=Failing)
+
+
 def test_a_search_stays_within_the_image() -> None:
     assert search_of([10, 20, 4, 6], (96, 64)) == [12, 23, 4, 6]
     assert search_of([-50, 100, -3, 5000], (96, 64)) == [0, 64, 1, 64]
