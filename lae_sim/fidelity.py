@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli import exit_status
@@ -76,8 +75,9 @@ def parser() -> argparse.ArgumentParser:
     )
     add = made.add_argument
     add("trace", metavar="TRACE", help="a trace of every frame")
-    add("--closed-loop", nargs="+", required=True, metavar="TRACE", help="real-time traces")
-    add("--strided", nargs="+", default=[], metavar="TRACE", help="passes on every N-th frame")
+    several: Any = {"nargs": "+", "action": "extend", "default": [], "metavar": "TRACE"}
+    add("--closed-loop", **several, required=True, help="real-time traces")
+    add("--strided", **several, help="passes on every N-th frame")
     add("--forecaster", nargs="+", default=["hold"], metavar="NAME", help="default: hold")
     add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
     add("--per-sequence", action="store_true", help="report each sequence")
@@ -152,7 +152,7 @@ def _compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
                 auc, dp = (found.scores[m][f, i, 0] for m in ("auc", "dp20"))
                 closed_auc, closed_dp = (reference.scores[m][f, i, 0] for m in ("auc", "dp20"))
                 yield {
-                    "closed_loop": Path(path).name,
+                    "closed_loop": path,
                     "forecaster": forecaster,
                     "replay": kind,
                     "sequence": run.recording.name,

@@ -17,7 +17,7 @@ from lae_sim.errors import LaeError
 from lae_sim.files import written_whole
 from lae_sim.metadata import Metadata
 from lae_sim.recording import Recording
-from lae_sim.trace import Trace, read_trace, write_trace
+from lae_sim.trace import Trace, read_trace, validate, write_trace
 
 _SETTINGS = "settings.json"
 
@@ -38,8 +38,7 @@ class Journal:
         """
         self._folder = folder
         text = json.dumps(settings, indent=2, sort_keys=True)
-        if not folder.exists():
-            _make(folder)
+        if _made(folder):
             with written_whole(folder / _SETTINGS) as path:
                 path.write_text(text)
             return
@@ -48,8 +47,8 @@ class Journal:
                 f"{folder} holds an unfinished profile: go on with it by --resume, or remove it"
             )
         try:
-            before = json.loads((folder / _SETTINGS).read_text())
-        except (OSError, ValueError) as error:
+            before = dict(json.loads((folder / _SETTINGS).read_text()))
+        except (OSError, ValueError, TypeError) as error:
             raise LaeError(
                 f"{folder}: cannot be resumed, remove it to start anew: {error}"
             ) from error
@@ -61,6 +60,11 @@ class Journal:
                 f"{folder} is a profile with {key} {before.get(key)!r}, not {now.get(key)!r}: "
                 "resume it with the same settings, or remove it"
             )
+        for part in folder.glob("*/[!.]*.parquet"):
+            try:
+                validate(part)
+            except LaeError:  # it is run again
+                part.unlink()
 
     def finished(self, name: str) -> list[str]:
         """The finished sequences of a pass, sorted."""
@@ -69,7 +73,7 @@ class Journal:
     def add(self, name: str, recording: Recording, metadata: Metadata) -> None:
         """Keep a finished sequence of a pass."""
         folder = self._folder / name
-        _make(folder)
+        _made(folder)
         write_trace(Trace(metadata, [recording]), folder / _file_name(recording.name))
 
     def metadata(self, name: str) -> list[Metadata]:
@@ -93,8 +97,12 @@ def _file_name(sequence: str) -> str:
     return quote(sequence, safe=" ").replace(".", "%2E") + ".parquet"
 
 
-def _make(folder: Path) -> None:
+def _made(folder: Path) -> bool:
+    """Make a folder; whether it was not there yet."""
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir()
+    except FileExistsError:
+        return False
     except OSError as error:
         raise LaeError(f"cannot make the folder {folder}: {error.strerror or error}") from error
+    return True

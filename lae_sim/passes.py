@@ -17,15 +17,15 @@ from lae_sim.errors import LaeError
 from lae_sim.frames import Buffered, Dataset, ImageSequence
 from lae_sim.journal import Journal
 from lae_sim.latency import by_frame
-from lae_sim.live import LiveRun
+from lae_sim.live import Live, LiveRun
 from lae_sim.metadata import FORMAT, VERSION, Metadata
 from lae_sim.timed import TimedTracker, TrackerError
 from lae_sim.trace import Trace, read_trace, write_trace
 
 READING_INTERVAL_S = 10.0
 
-Timing = Callable[[str], Service]
-"""``timing(sequence)`` makes the service that times a sequence, by its name."""
+Timing = Callable[[ImageSequence], Service]
+"""``timing(sequence)`` makes the service that times a sequence."""
 
 Progress = Callable[[int], object]
 """``progress(frames)`` is told how many more world frames are done."""
@@ -64,12 +64,18 @@ def parse_timing(text: str) -> tuple[str, Timing]:
         elapsed_ns = parse_duration(value)
         return f"constant {value}, not measured", lambda sequence: lambda frame: elapsed_ns
     trace = read_trace(text)
-    services = {recording.name: by_frame(recording) for recording in trace}
+    recordings = {recording.name: recording for recording in trace}
 
-    def timing(sequence: str) -> Service:
-        if sequence not in services:
-            raise LaeError(f"{text}: has no times of sequence {sequence!r}")
-        return services[sequence]
+    def timing(sequence: ImageSequence) -> Service:
+        found = recordings.get(sequence.name)
+        if found is None:
+            raise LaeError(f"{text}: has no times of sequence {sequence.name!r}")
+        if len(found) != len(sequence):
+            raise LaeError(
+                f"{text}: has {len(found)} frames of sequence {sequence.name!r}, which has "
+                f"{len(sequence)} here"
+            )
+        return by_frame(found)
 
     return f"{Path(text).name} ({trace.metadata.device}), not measured here", timing
 
@@ -169,7 +175,7 @@ def run_pass(
             run = task.run(ready if buffered else sequence, progress=advance)
         except LaeError as error:
             failures.append({"sequence": sequence.name, "reason": str(error)})
-            cold = isinstance(error, TrackerError)
+            cold = cold or isinstance(error, TrackerError)
         else:
             during = []
             if time.monotonic() - read_at > READING_INTERVAL_S:
@@ -238,10 +244,10 @@ def warm_up(tracker: TimedTracker, sequence: ImageSequence, calls: int) -> None:
         LaeError: if a frame cannot be read, or the tracker fails.
     """
     if calls:
-        tracker.init(sequence.read(0), sequence.truth[0].tolist())
-        following = sequence.read(min(1, len(sequence) - 1))
+        live = Live(sequence, tracker)
+        live(0)
         for _ in range(calls):
-            tracker.track(following)
+            live(min(1, len(sequence) - 1))
 
 
 def _of_sequence(

@@ -98,7 +98,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="folder of the dataset, or a video (default: synthetic)",
     )
-    add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
+    add("--sequence", nargs="+", action="extend", metavar="NAME", help="these sequences only")
     add("--box", type=argument(_box), metavar="X,Y,W,H", help="first box, for a video")
     add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the dataset's)")
     group = made.add_argument_group("the run")
@@ -120,6 +120,7 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--stride",
         nargs="+",
+        action="extend",
         type=argument(partial(_whole, least=2)),
         default=[],
         metavar="N",
@@ -128,6 +129,7 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--closed-loop",
         nargs="+",
+        action="extend",
         default=[],
         metavar="TIMING",
         help="further real-time passes under these times, for lae-sim fidelity",
@@ -292,7 +294,7 @@ def _passes(
         source, times = parse_timing(timing) if timing else ("measured", None)
 
         def run(sequence: ImageSequence, progress: Progress) -> LiveRun:
-            service = times(sequence.name) if times else None
+            service = times(sequence) if times else None
             return run_real_time(
                 sequence, clock=clock, policy=policy, service=service, progress=progress, **common
             )
@@ -357,7 +359,8 @@ def _print_summary(reports: Sequence[Mapping[str, Any]]) -> None:
 
 def _short(timing: str) -> str:
     """What tells a closed loop's trace from others."""
-    return Path(timing.removeprefix("constant:")).stem
+    constant = timing.startswith("constant:")
+    return timing.removeprefix("constant:") if constant else Path(timing).stem
 
 
 def _key_and_value(text: str) -> tuple[str, str]:

@@ -77,7 +77,9 @@ def replay_sequence(
                 f"sequence {recording.name!r} has {len(recording)} frames in one trace and "
                 f"{len(other)} in another"
             )
-    schedule = simulate(len(recording), clock, source(times or recording), policy)
+    schedule = simulate(
+        len(recording), clock, source(recording if times is None else times), policy
+    )
     frames = schedule.frames
     if strided:
         return _from_passes({stride: recording, **strided}, recording, schedule)

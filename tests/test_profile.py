@@ -136,11 +136,14 @@ def test_a_profile_becomes_a_trace_with_its_provenance(here: Path) -> None:
 
 
 def test_json_says_the_same(here: Path) -> None:
-    out, _ = profile(here, *MINE, "--sequence", "a", "--json", "--in-process", "--stride", "2")
+    passes = ("--stride", "2", "--stride", "3", "--closed-loop", "constant:0.5ms")
+    out, _ = profile(here, *MINE, "--sequence", "a", "--json", "--in-process", *passes)
     report = json.loads(out)
     assert [trace["trace"] for trace in report["traces"]] == [
         "mine-Bright-data.parquet",
         "mine-Bright-data.stride2.parquet",
+        "mine-Bright-data.stride3.parquet",
+        "mine-Bright-data.closed-loop-0.5ms.parquet",
     ]
     assert report["traces"][0]["world_frames"] == report["traces"][0]["processed"] == 20
     assert report["failures"] == []
