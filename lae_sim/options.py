@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import importlib
-import sys
 from fractions import Fraction
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lae_sim.cli import argument
 from lae_sim.clock import parse_duration, parse_fps, parse_rational
 from lae_sim.errors import LaeError
+from lae_sim.trackers.names import imported
 
 if TYPE_CHECKING:
     from lae_sim.engine import Policy
@@ -115,24 +113,12 @@ def load_forecaster(name: str) -> ForecasterFactory:
     }
     if name in built_in:
         return built_in[name]
-    module_name, colon, attribute = name.partition(":")
-    if not colon:
+    if ":" not in name:
         raise LaeError(
             f"no forecaster {name!r}: there are {', '.join(built_in)}, and package.module:factory"
         )
-    here = str(Path.cwd())
-    sys.path.insert(0, here)
-    try:
-        factory: Any = importlib.import_module(module_name)
-        for part in attribute.split("."):
-            factory = getattr(factory, part)
-    except Exception as error:  # a user's module may fail in any way while it is imported
-        raise LaeError(f"forecaster {name!r}: {type(error).__name__}: {error}") from error
-    finally:
-        sys.path.remove(here)
-    if not callable(factory):
-        raise LaeError(f"forecaster {name!r} is not callable")
-    return factory  # type: ignore[no-any-return]
+    factory: ForecasterFactory = imported(f"forecaster {name!r}", name)
+    return factory
 
 
 def _whole(text: str, value: str, least: int = 0) -> int:

@@ -87,9 +87,9 @@ def test_a_forecaster_of_the_current_folder(
 ) -> None:
     (tmp_path / "my_forecasters_of_a_test.py").write_text("def make(box, size): ...\n")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
     factory = load_forecaster("my_forecasters_of_a_test:make")
     assert factory.__name__ == "make"
-    assert str(tmp_path) not in sys.path
     monkeypatch.delitem(sys.modules, "my_forecasters_of_a_test")
 
 
@@ -116,5 +116,6 @@ def test_a_module_that_fails_while_it_is_imported_is_reported(
 ) -> None:
     (tmp_path / "failing_of_a_test.py").write_text("1 / 0\n")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
     with pytest.raises(LaeError, match="ZeroDivisionError: division by zero"):
         load_forecaster("failing_of_a_test:make")

@@ -44,7 +44,7 @@ def make_tracker(name: str, options: Mapping[str, Any]) -> Tracker:
         factory = getattr(importlib.import_module("lae_sim.trackers." + module), attribute)
         positional = [value] if value else []
     elif colon and kind not in _BUILT_IN:
-        factory, positional = _imported(name, kind, value), []
+        factory, positional = imported(f"tracker {name!r}", name), []
     else:
         raise LaeError(f"no tracker {name!r}: there are {NAMES}")
     try:
@@ -74,7 +74,17 @@ def _value(text: str) -> Any:
     return number if math.isfinite(number) else text
 
 
-def _imported(name: str, module: str, attribute: str) -> Any:
+def imported(what: str, path: str) -> Any:
+    """What a user made and names as ``package.module:factory``.
+
+    Args:
+        what: what it is to be, for messages.
+        path: the module, which is also looked for in the current folder, and a name in it.
+
+    Raises:
+        LaeError: if it cannot be imported, or not be called.
+    """
+    module, _, attribute = path.partition(":")
     here = os.getcwd()
     if here not in sys.path:
         sys.path.insert(0, here)
@@ -83,9 +93,9 @@ def _imported(name: str, module: str, attribute: str) -> Any:
         for part in attribute.split("."):
             factory = getattr(factory, part)
     except Exception as error:  # a user's module may fail in any way while it is imported
-        raise LaeError(f"tracker {name!r}: {type(error).__name__}: {error}") from error
+        raise LaeError(f"{what}: {type(error).__name__}: {error}") from error
     if not callable(factory):
-        raise LaeError(f"tracker {name!r} is not callable")
+        raise LaeError(f"{what} is not callable")
     return factory
 
 
