@@ -96,7 +96,8 @@ def _fidelity(arguments: argparse.Namespace) -> None:
 
     from lae_sim import __version__
 
-    rows = [row for path in arguments.closed_loop for row in _compared(path, arguments)]
+    closed_loops = dict.fromkeys(arguments.closed_loop)
+    rows = [row for path in closed_loops for row in _compared(path, arguments)]
     groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[key] for key in GROUP), []).append(row)
@@ -127,6 +128,11 @@ def _compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
     from lae_sim.trace import read_trace
 
     closed = read_trace(path)
+    if closed.metadata.kind != "real-time":
+        raise LaeError(
+            f"{path}: a trace of every frame is no closed loop: give one that "
+            "'lae-sim profile --closed-loop' or '--mode real-time' left"
+        )
     names = [recording.name for recording in closed]
     every, *strided = (read_trace(other, names) for other in [arguments.trace, *arguments.strided])
     for trace in (every, *strided):
@@ -204,20 +210,14 @@ def _summary(rows: Sequence[Row]) -> Row:
     """Means over the sequences that count."""
     import numpy as np
 
-    columns = {key: np.array([row[key] for row in rows]) for key in ("auc", "closed_auc", "d_auc")}
-    columns |= {
-        key: np.array([row[key] for row in rows]) for key in ("closed_dp20", "dp20", "d_dp20")
-    }
-    known = {key: values[~np.isnan(values)] for key, values in columns.items()}
-    return {
-        "sequences": len(rows),
-        **{key: float(known[key].mean()) for key in ("closed_auc", "auc", "closed_dp20", "dp20")},
-        **{
-            f"{name}_abs_{key}": float(getattr(np, name)(np.abs(known[key])))
-            for key in ("d_auc", "d_dp20")
-            for name in ("mean", "median", "max")
-        },
-    }
+    found: Row = {"sequences": len(rows)}
+    for metric in ("auc", "dp20"):
+        for key in (f"closed_{metric}", metric):
+            found[key] = float(np.nanmean([row[key] for row in rows]))
+        apart = np.abs([row[f"d_{metric}"] for row in rows])
+        for name in ("mean", "median", "max"):
+            found[f"{name}_abs_d_{metric}"] = float(getattr(np, f"nan{name}")(apart))
+    return found
 
 
 def _table(rows: Sequence[Row], columns: Mapping[str, str], left: int) -> str:

@@ -389,3 +389,7 @@ def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
     _, err = process.communicate(timeout=120)
     assert process.returncode == 2
     assert "same tracker" in err
+    process = start(here, "t.parquet", "--closed-loop", "t.parquet", module="fidelity")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert "no closed loop" in err
