@@ -10,6 +10,7 @@ from lae_sim.evaluation import Evaluation
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import Convention
 from lae_sim.run import Run
+from lae_sim.timing import STALL
 
 TRUSTED_DISAGREEMENT = 0.05
 
@@ -25,7 +26,7 @@ class SkippedStalls:
         skipped = run.recording.elapsed_ns.copy()
         typical = np.median(skipped[skipped >= 0])
         skipped[run.schedule.frames] = -1
-        stalls = skipped[skipped > 10 * typical]
+        stalls = skipped[skipped > STALL * typical]
         self._count += len(stalls)
         self._longest_ns = max([self._longest_ns, *stalls.tolist()])
 
@@ -34,7 +35,7 @@ class SkippedStalls:
         if not self._count:
             return []
         return [
-            f"{self._count} recorded times above 10 times the median (the longest "
+            f"{self._count} recorded times above {STALL} times the median (the longest "
             f"{self._longest_ns / 1e9:.3g} s) are of skipped frames; --latency by-call meets them"
         ]
 

@@ -180,8 +180,7 @@ def _profile(arguments: argparse.Namespace) -> int:
     interrupted = False
     with closing(_tracker(arguments)) as tracker:
         passes = _passes(arguments, dataset, tracker, out)
-        settings = {**_settings(arguments), "tracker": dict(tracker.describe())}
-        journal = Journal(unfinished, settings, arguments.resume)
+        journal = Journal(unfinished, _settings(arguments, tracker), arguments.resume)
         total = sum(map(len, dataset.sequences)) * sum(task.rounds for task in passes)
         with tqdm(total=total, desc=arguments.tracker, unit=" frames", disable=None) as bar:
             try:
@@ -329,13 +328,15 @@ def _passes(
     return passes
 
 
-def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
+def _settings(arguments: argparse.Namespace, tracker: TimedTracker) -> dict[str, Any]:
     """What decides the results, for a resumed run to compare."""
     given = {k: str(v) for k, v in vars(arguments).items() if k not in ("out", "resume", "json")}
-    return {"lae_sim": __version__, **given}
+    return {"lae_sim": __version__, **given, "described": dict(tracker.describe())}
 
 
 def _print_summary(reports: Sequence[Mapping[str, Any]]) -> None:
+    import shlex
+
     from lae_sim.report import table
 
     header = ["trace", "sequences", "frames", "processed", "lost", "init ms", "median ms", "p95 ms"]
@@ -346,9 +347,10 @@ def _print_summary(reports: Sequence[Mapping[str, Any]]) -> None:
         for r in reports
     ]
     print(table(header, lines, left=1))
-    first = reports[0]["trace"]
-    strided = [r["trace"] for r in reports if "stride" in r["schedule"]]
-    closed = [r["trace"] for r in reports[1:] if r["schedule"]["kind"] == "real-time"]
+    first, *others = (shlex.quote(r["trace"]) for r in reports)
+    kinds = [r["schedule"]["kind"] for r in reports]
+    strided = [t for t, r in zip(others, reports[1:]) if "stride" in r["schedule"]]
+    closed = [t for t, kind in zip(others, kinds[1:]) if kind == "real-time" != kinds[0]]
     passes = f" --strided {' '.join(strided)}" if strided else ""
     print("\nnext:")
     print(f"  lae-sim replay {first}{passes}")

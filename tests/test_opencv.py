@@ -85,6 +85,14 @@ def test_boxes_on_which_mil_would_hang_are_refused(box):
         tracker.track(frame)
 
 
+def test_a_box_that_opencv_refuses_is_told():
+    frame = next(moving(straight(1)))
+    with pytest.raises(
+        LaeError, match=r"^opencv:mil refused to start on the box \[-9, -9, 999, 999\]"
+    ):
+        make_tracker("opencv:mil", {}).init(frame, (-9, -9, 999, 999))
+
+
 def test_track_before_init_is_refused():
     with pytest.raises(LaeError, match="opencv:mil: init must come before track"):
         make_tracker("opencv:mil", {}).track(next(moving(straight(1))))

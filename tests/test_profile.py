@@ -250,6 +250,8 @@ def test_kill_and_resume(here: Path) -> None:
     assert "--resume" in err
     _, err = profile(here, *options[:-1], "1", "--resume", status=2)
     assert "warmup" in err
+    _, err = profile(here, *options, "--tracker", "mine:Searching", "--resume", status=2)
+    assert "tracker 'mine:Bright', not 'mine:Searching'" in err
     process = start(here, *options, "--resume")
     _, err = process.communicate(timeout=120)
     assert process.returncode == 0, err

@@ -102,8 +102,12 @@ class OpenCv:
             )
         _seed(self._seed)
         tracker = self._new()
-        if tracker.init(frame, whole) is False:  # trackers of cv2.legacy; others raise
-            raise LaeError(f"opencv:{self._name} refused to start on the box {list(box)}")
+        refusal = f"opencv:{self._name} refused to start on the box {list(box)}"
+        try:
+            if tracker.init(frame, whole) is False:  # trackers of cv2.legacy; others raise
+                raise LaeError(refusal)
+        except cv2.error as error:
+            raise LaeError(f"{refusal}: {error.err}") from error
         self._tracker, self._shape = tracker, frame.shape
 
     def track(self, frame: Image) -> Any:
