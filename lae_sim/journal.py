@@ -57,7 +57,8 @@ class Journal:
         if changed:
             key = changed[0]
             raise LaeError(
-                f"{folder} is a profile with {key} {before.get(key)!r}, not {now.get(key)!r}: "
+                f"{folder} is a profile with {key} {before.get(key)!r:.200}, "
+                f"not {now.get(key)!r:.200}: "
                 "resume it with the same settings, or remove it"
             )
         for part in folder.glob("*/[!.]*.parquet"):

@@ -331,7 +331,8 @@ def _passes(
 def _settings(arguments: argparse.Namespace, tracker: TimedTracker) -> dict[str, Any]:
     """What decides the results, for a resumed run to compare."""
     given = {k: str(v) for k, v in vars(arguments).items() if k not in ("out", "resume", "json")}
-    return {"lae_sim": __version__, **given, "described": dict(tracker.describe())}
+    told = {f"tracker's {key}": value for key, value in tracker.describe().items()}
+    return {"lae_sim": __version__, **given, **told}
 
 
 def _print_summary(reports: Sequence[Mapping[str, Any]]) -> None:
