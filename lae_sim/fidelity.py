@@ -59,8 +59,8 @@ replay can be trusted on.
 
 EXAMPLES = """\
 examples:
-  lae-sim profile --stride 2 3 --closed-loop constant:47ms constant:100ms --out t.parquet
-  lae-sim fidelity t.parquet --strided t.stride2.parquet t.stride3.parquet \\
+  lae-sim profile --stride 3/2 2 3 --closed-loop constant:47ms constant:100ms --out t.parquet
+  lae-sim fidelity t.parquet --strided t.stride3-2.parquet t.stride2.parquet t.stride3.parquet \\
       --closed-loop t.closed-loop-47ms.parquet t.closed-loop-100ms.parquet --per-sequence
 """
 
@@ -113,8 +113,7 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     print(_table(summary, SUMMARY_COLUMNS, left=3), end="\n\n")
     print(
         f"AUC by convention {arguments.convention}; |d| is |replay - closed loop| of a sequence.\n"
-        "every-frame: boxes of TRACE alone; strided: each from the pass that fits the frames "
-        "skipped."
+        "every-frame: boxes of TRACE; strided: of the pass nearest to the frames skipped."
     )
 
 

@@ -22,8 +22,9 @@ from lae_sim.engine import Ints, Policy, Service, simulate
 from lae_sim.errors import LaeError, explained
 from lae_sim.forecast import Forecaster, ForecasterFactory
 from lae_sim.frames import Image, ImageSequence
-from lae_sim.policies import every, latest
+from lae_sim.policies import latest, listed
 from lae_sim.recording import Recording
+from lae_sim.strides import phases
 from lae_sim.timed import Answer, TimedTracker
 
 
@@ -75,44 +76,40 @@ def run_real_time(
 
 
 def run_every_frame(
-    sequence: ImageSequence, tracker: TimedTracker, stride: int = 1, **options: Any
+    sequence: ImageSequence,
+    tracker: TimedTracker,
+    stride: Fraction = Fraction(1),
+    **options: Any,
 ) -> LiveRun:
     """Run a tracker on every frame; the world waits for it.
 
-    With a stride it is run on every ``stride``-th frame, once from each of the first ``stride``
-    frames. So every frame f has a box, for which the tracker had last seen frame max(f - stride,
-    0).
-
     Args:
         sequence, tracker, options: as of :func:`run_real_time`.
-        stride: frames from one processed frame to the next.
+        stride: above 1, the tracker goes through the sequence in several phases, each of which
+            skips frames, until every frame has been processed (see :mod:`lae_sim.strides`).
 
     Raises:
         LaeError: as :func:`run_real_time`.
     """
-    any_rate = Clock.at(Fraction(1))
+    length = len(sequence)
     runs = []
-    for first in range(1, max(min(stride, len(sequence) - 1), 1) + 1):
+    for frames in phases(Fraction(stride), length):
         live = Live(sequence, tracker, **options)
 
         def instantly(frame: int, process: Service = live) -> int:
             process(frame)
             return 0
 
-        schedule = simulate(len(sequence), any_rate, instantly, every(stride, first))
-        runs.append(live.result(schedule.frames))
-    whole, *others = runs
-    measured = np.zeros(len(sequence), np.int64)
-    for run in reversed(runs):  # so that frame 0 is the first run's
+        simulate(length, Clock.at(Fraction(1)), instantly, listed(frames.tolist()))
+        runs.append(live.result(frames))
+    whole, measured = runs[-1], np.zeros(length, np.int64)
+    for run in reversed(runs):  # of the phases that hold a frame, the first stands
         measured[run.frames] = run.measured_ns
-    for run in others:
-        frames = run.frames[1:]
-        whole.recording.boxes[frames] = run.recording.boxes[frames]
-        whole.recording.elapsed_ns[frames] = run.recording.elapsed_ns[frames]
-        whole.recording.score[frames] = run.recording.score[frames]
+        for name in ("boxes", "elapsed_ns", "score"):
+            getattr(whole.recording, name)[run.frames] = getattr(run.recording, name)[run.frames]
     return replace(
         whole,
-        frames=np.arange(len(sequence)),
+        frames=np.arange(length),
         measured_ns=measured,
         cpu_ns=sum(run.cpu_ns for run in runs),
         lost=np.unique(np.concatenate([run.lost for run in runs])),

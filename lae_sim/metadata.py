@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from lae_sim.clock import parse_fps
+from lae_sim.clock import parse_fps, parse_rational
 from lae_sim.errors import LaeError, TraceError
 
 FORMAT = "lae-trace"
@@ -108,9 +108,9 @@ class Metadata:
         return str(dataset.get("name", "unknown") if isinstance(dataset, dict) else dataset)
 
     @property
-    def stride(self) -> int:
-        """Frames from one processed frame to the next, in a trace of every frame; 1 if not said."""
-        return int(self.document["schedule"].get("stride", 1))
+    def stride(self) -> Fraction:
+        """Mean frames from one processed frame to the next (see :mod:`lae_sim.strides`)."""
+        return parse_rational(self.document["schedule"].get("stride", "1"))
 
     @property
     def profiled(self) -> bool:
@@ -168,9 +168,13 @@ def _kind(document: Mapping[str, Any]) -> str:
     kind = schedule.get("kind") if isinstance(schedule, dict) else None
     if kind not in KINDS:
         raise TraceError(f"metadata key 'schedule.kind' must be one of {', '.join(KINDS)}")
-    stride = schedule.get("stride", 1) if isinstance(schedule, dict) else 1
-    if type(stride) is not int or not 0 < stride < 2**31:
-        raise TraceError("metadata key 'schedule.stride' must be a whole number above zero")
+    stride = schedule.get("stride", "1") if isinstance(schedule, dict) else "1"
+    try:
+        fits = isinstance(stride, str) and parse_rational(stride) >= 1
+    except LaeError:
+        fits = False
+    if not fits:
+        raise TraceError("metadata key 'schedule.stride' must be text such as '2' or '3/2'")
     return str(kind)
 
 

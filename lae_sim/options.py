@@ -39,8 +39,8 @@ def add_world(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="TRACE",
-        help="passes on every N-th frame (lae-sim profile --stride): each box comes from the pass "
-        "that fits the frames skipped",
+        help="passes on every N-th frame (lae-sim profile --stride): each sequence's boxes come "
+        "from the pass that is nearest to the frames skipped",
     )
 
 

@@ -34,19 +34,25 @@ def fifo(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
     return _start(clock, now, last + 1)
 
 
-def every(n: int, first: int | None = None) -> Policy:
-    """Every ``n``-th frame in order, a fixed stride; they queue if the tracker is slower.
-
-    Args:
-        n: the stride, frames.
-        first: the frame after frame 0, if not ``n``: another phase of the same stride.
-    """
+def every(n: int) -> Policy:
+    """Every ``n``-th frame in order, a fixed stride; they queue if the tracker is slower."""
 
     def fixed_stride(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         last, _, now = calls[-1]
-        return _start(clock, now, last + n if last or first is None else first)
+        return _start(clock, now, last + n)
 
     return fixed_stride
+
+
+def listed(frames: Sequence[int]) -> Policy:
+    """These frames in order; they queue if the tracker is slower."""
+
+    def next_listed(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        _, _, now = calls[-1]
+        beyond = len(calls) >= len(frames)
+        return _start(clock, now, frames[-1] + 2**40 if beyond else frames[len(calls)])
+
+    return next_listed
 
 
 def shrinking_tail(expected_ns: int) -> Policy:

@@ -6,13 +6,14 @@ import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
 from lae_sim.cli import argument, exit_status
-from lae_sim.clock import NS_PER_SECOND, parse_duration, parse_fps
+from lae_sim.clock import NS_PER_SECOND, parse_duration, parse_fps, parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.options import load_forecaster, parse_policy
 
@@ -27,11 +28,11 @@ PROGRAM = "lae-sim profile"
 EXAMPLES = """\
 examples:
   lae-sim profile                                      dcf on the synthetic sequences: try it out
-  lae-sim profile --dataset DTB70 --root ~/data/DTB70 --stride 2 3
+  lae-sim profile --dataset DTB70 --root ~/data/DTB70 --stride 3/2 2 3
   lae-sim profile --tracker nanotrack --option weights=nanotrackv3 --root ~/data/DTB70
   lae-sim profile --tracker my_package.my_module:MyTracker --option size=small --device cuda:0
   lae-sim profile --mode real-time --pre-forecaster kalman --timing jetson.parquet
-  lae-sim profile --closed-loop constant:47ms constant:100ms --stride 2 3    then lae-sim fidelity
+  lae-sim profile --closed-loop constant:47ms constant:100ms --stride 3/2 2 3  then lae-sim fidelity
 
 trackers:
   dcf                     a correlation filter, no weights needed
@@ -121,10 +122,10 @@ def parser() -> argparse.ArgumentParser:
         "--stride",
         nargs="+",
         action="extend",
-        type=argument(partial(_whole, least=2)),
+        type=argument(_stride),
         default=[],
         metavar="N",
-        help="further passes on every N-th frame, which make replays closer",
+        help="further passes on every N-th frame (3/2: two of three), which make replays closer",
     )
     add(
         "--closed-loop",
@@ -262,6 +263,7 @@ def _passes(
     from lae_sim.files import check_distinct
     from lae_sim.live import run_every_frame, run_real_time
     from lae_sim.passes import Pass, base_document, parse_timing, scheduled
+    from lae_sim.strides import phases
     from lae_sim.translation import Translated
 
     clock = Clock.at(dataset.fps)
@@ -310,11 +312,11 @@ def _passes(
     passes += [whole(f"repeat{n}") for n in range(2, arguments.repeat + 1)]
     passes += [
         task(
-            f"stride{stride}",
+            f"stride{stride}".replace("/", "-"),
             partial(run_every_frame, stride=stride, **common),
-            rounds=stride,
+            rounds=len(phases(stride, 4 * stride.numerator)),
             kind="every-frame",
-            stride=stride,
+            stride=str(stride),
         )
         for stride in dict.fromkeys(arguments.stride)
     ]
@@ -379,6 +381,13 @@ def _box(text: str) -> tuple[float, ...]:
     except ValueError as error:
         raise LaeError(f"{text!r} is not a box x,y,w,h in pixels") from error
     return x, y, w, h
+
+
+def _stride(text: str) -> Fraction:
+    stride = parse_rational(text)
+    if not (stride > 1 and stride.numerator <= 1000):
+        raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {text!r}")
+    return stride
 
 
 def _whole(text: str, least: int = 0) -> int:

@@ -228,8 +228,8 @@ def settings_text(report: Report) -> str:
         lines.append("  exact: every output follows the same frame as when it was recorded")
     elif report["strided"]:
         lines.append(
-            f"  approximate: boxes come from passes of {1 + len(report['strided'])} strides, the "
-            f"nearest to the frames\n  skipped; {share} follow another output than in their pass"
+            f"  approximate: boxes come from passes of {1 + len(report['strided'])} strides, each "
+            f"sequence's\n  from the nearest; {share} follow another frame than in their pass"
         )
     else:
         lines.append(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import combinations
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from lae_sim.errors import LaeError
 from lae_sim.latency import LatencySource, by_frame
 from lae_sim.policies import latest
 from lae_sim.recording import Recording
+from lae_sim.strides import followed
 from lae_sim.trace import Trace
 
 
@@ -24,15 +24,15 @@ class Run:
     """One sequence replayed.
 
     Attributes:
-        recording: the sequence as recorded.
+        recording: the sequence as recorded, in the pass that the boxes are taken from.
         schedule: what was processed, and when.
         boxes: the box of each processed frame, float64 [n, 4].
-        departures: processed frames (the first left out) that did not follow the same frame, with
-            the same box, when they were recorded. Above 0, the boxes of a stateful tracker are an
-            approximation: it would have seen other motion.
-        disagreement: share of processed frames where the boxes of two of the passes concerned
-            overlap less than half, 0 if the replay is exact, NaN without strided passes. Where it
-            is high the tracker's luck depends on the frames that it sees.
+        departures: processed frames (the first left out) whose preceding processed frame is not
+            the one they followed when they were recorded. Above 0, the boxes of a stateful tracker
+            are an approximation: it would have seen other motion.
+        disagreement: share of processed frames where the box of the next lower or next higher
+            stride overlaps less than half, 0 if the replay is exact, NaN without strided passes.
+            Where it is high the tracker's luck depends on the frames that it sees.
     """
 
     recording: Recording
@@ -52,8 +52,8 @@ def replay_sequence(
     source: LatencySource = by_frame,
     policy: Policy = latest,
     times: Recording | None = None,
-    stride: int = 1,
-    strided: Mapping[int, Recording] | None = None,
+    stride: Fraction = Fraction(1),
+    strided: Mapping[Fraction, Recording] | None = None,
 ) -> Run:
     """Replay a recording under a latency source and a policy.
 
@@ -63,9 +63,9 @@ def replay_sequence(
         source: how to take processing times from a recording.
         policy: which frame is processed next.
         times: the same sequence recorded on another device, to take the times from.
-        stride: that of the recording, if it holds every frame: frame f followed f - stride.
-        strided: recordings of every frame at other strides. Each output is taken from the pass
-            whose stride is nearest to the frames since the output before.
+        stride: that of the recording, if it holds every frame (see :mod:`lae_sim.strides`).
+        strided: recordings of every frame at other strides. The boxes are taken from the pass whose
+            stride is nearest to the mean number of frames from one output to the next.
 
     Raises:
         LaeError: if a frame is asked for that the recording lacks, or the recordings differ in
@@ -82,10 +82,9 @@ def replay_sequence(
     )
     frames = schedule.frames
     if strided:
-        return _from_passes({stride: recording, **strided}, recording, schedule)
+        return _from_passes({stride: recording, **strided}, schedule)
     boxes = _boxes(recording, frames)
-    followed = _followed(recording, frames, stride)
-    return Run(recording, schedule, boxes, int(np.count_nonzero(followed != frames[:-1])))
+    return Run(recording, schedule, boxes, _departures(recording, frames, stride))
 
 
 def _boxes(recording: Recording, frames: Ints) -> Floats:
@@ -100,32 +99,29 @@ def _boxes(recording: Recording, frames: Ints) -> Floats:
     return boxes
 
 
-def _followed(recording: Recording, frames: Ints, stride: int) -> Ints:
-    """The frame that each but the first of some frames followed when it was recorded."""
+def _departures(recording: Recording, frames: Ints, stride: Fraction) -> int:
+    """How many of some frames followed another one when they were recorded."""
     if stride > 1:
-        return np.maximum(frames[1:] - stride, 0)
-    recorded = np.flatnonzero(~np.isnan(recording.boxes[:, 0]))
-    followed: Ints = recorded[np.searchsorted(recorded, frames[1:]) - 1]
-    return followed
+        before = followed(stride, len(recording))[frames[1:]]
+    else:
+        recorded = np.flatnonzero(~np.isnan(recording.boxes[:, 0]))
+        before = recorded[np.searchsorted(recorded, frames[1:]) - 1]
+    return int(np.count_nonzero(before != frames[:-1]))
 
 
-def _from_passes(passes: Mapping[int, Recording], recording: Recording, schedule: Schedule) -> Run:
-    """The run whose outputs come from the passes that fit their steps best."""
+def _from_passes(passes: Mapping[Fraction, Recording], schedule: Schedule) -> Run:
+    """The run whose boxes come from the pass that is nearest to its mean step."""
     frames = schedule.frames
-    steps = np.diff(frames, prepend=frames[0] - 1)
-    strides = np.array(sorted(passes))
-    chosen = np.abs(steps[:, None] - strides).argmin(axis=1)
-    stacked = np.stack([_boxes(passes[stride], frames) for stride in strides.tolist()])
-    boxes = stacked[chosen, np.arange(len(frames))]
-    followed = np.stack([_followed(passes[s], frames, s) for s in strides.tolist()])
-    rest = np.arange(len(frames) - 1)
-    before = stacked[chosen[1:], rest]  # what the pass of an output answered for the one before
-    same = (followed[chosen[1:], rest] == frames[:-1]) & (before == boxes[:-1]).all(axis=1)
-    departures = int(np.count_nonzero(~same))
-    concerned = stacked[: chosen.max() + 1] if departures else stacked[:1]
-    apart = [iou(a, b) < PARTED_IOU for a, b in combinations(concerned, 2)]
-    disagreement = float(np.mean(np.any(apart, axis=0))) if apart else 0.0
-    return Run(recording, schedule, boxes, departures, disagreement)
+    step = Fraction(int(frames[-1]), max(len(frames) - 1, 1))
+    strides = sorted(passes)
+    nearest = min(range(len(strides)), key=lambda k: abs(strides[k] - step))
+    recording = passes[strides[nearest]]
+    boxes = _boxes(recording, frames)
+    departures = _departures(recording, frames, strides[nearest])
+    parted = np.zeros(len(frames), bool)
+    for stride in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
+        parted |= iou(_boxes(passes[stride], frames), boxes) < PARTED_IOU
+    return Run(recording, schedule, boxes, departures, float(parted.mean()))
 
 
 def replay_trace(

@@ -20,7 +20,7 @@ from lae_sim.frames import ImageSequence
 from lae_sim.kalman import Kalman
 from lae_sim.live import LiveRun, run_every_frame, run_real_time, search_of
 from lae_sim.metadata import Metadata
-from lae_sim.policies import every, fifo, latest, shrinking_tail, vot_realtime
+from lae_sim.policies import every, fifo, latest, listed, shrinking_tail, vot_realtime
 from lae_sim.recording import Recording
 from lae_sim.run import Run, replay_sequence, replay_trace
 from lae_sim.timed import Answer, TrackerError
@@ -87,14 +87,15 @@ def test_a_strided_pass_sees_each_frame_after_the_one_a_stride_before(
     times: list[int], stride: int
 ) -> None:
     sequence = bright_sequence(PATH)
-    strided = run_every_frame(sequence, FakeTimed(times), stride)
+    strided = run_every_frame(sequence, FakeTimed(times), Fraction(stride))
     assert not np.isnan(strided.recording.boxes).any()
     assert (strided.recording.elapsed_ns >= 0).all()
     for first in range(1, stride + 1):
         slow_world = Clock.at(Fraction(1, 9))
-        alone = run_real_time(sequence, FakeTimed(times), slow_world, every(stride, first))
+        alone = run_real_time(
+            sequence, FakeTimed(times), slow_world, listed([0, *range(first, len(PATH), stride)])
+        )
         frames = alone.frames
-        assert frames.tolist() == [0, *range(first, len(PATH), stride)]
         np.testing.assert_array_equal(
             strided.recording.boxes[frames], alone.recording.boxes[frames]
         )
@@ -102,9 +103,9 @@ def test_a_strided_pass_sees_each_frame_after_the_one_a_stride_before(
 
 
 def test_a_stride_longer_than_the_sequence() -> None:
-    run = run_every_frame(bright_sequence(PATH[:3]), FakeTimed(), 9)
+    run = run_every_frame(bright_sequence(PATH[:3]), FakeTimed(), Fraction(9))
     assert not np.isnan(run.recording.boxes).any()
-    one = run_every_frame(bright_sequence(PATH[:1]), FakeTimed(), 2)
+    one = run_every_frame(bright_sequence(PATH[:1]), FakeTimed(), Fraction(2))
     assert one.frames.tolist() == [0]
 
 
@@ -291,8 +292,8 @@ def test_strided_passes_make_a_replay_at_their_stride_exact(stride: int, at: int
     whole = Trace(kind, [run_every_frame(sequence, FakeTimed()).recording])
     strided = [
         Trace(
-            Metadata.new("30", "every-frame", schedule={"stride": k}),
-            [run_every_frame(sequence, FakeTimed(), k).recording],
+            Metadata.new("30", "every-frame", schedule={"stride": str(k)}),
+            [run_every_frame(sequence, FakeTimed(), Fraction(k)).recording],
         )
         for k in (2, 3)
     ]
@@ -317,15 +318,17 @@ def test_each_stride_once() -> None:
 
 
 def test_passes_that_part_are_told() -> None:
-    """Steps of 1 and 2 by turns: boxes by turns of two passes, which disagree from frame 8 on."""
+    """Steps of 1 and 2 by turns are nearest to 3/2, whose pass parts from that of 2 at frame 8."""
     near, far = [[1.0, 1, 9, 9]] * 16, [[1.0, 1, 9, 9]] * 8 + [[50.0, 1, 9, 9]] * 8
     elapsed = [50_000_000] * 16
-    whole = Recording.new("a", near, near, elapsed)
-    run = replay_sequence(whole, CLOCK, strided={2: Recording.new("a", near, far, elapsed)})
+    every, half = (Recording.new("a", near, boxes, elapsed) for boxes in (near, far))
+    run = replay_sequence(every, CLOCK, strided={Fraction(3, 2): every, Fraction(2): half})
     frames = run.schedule.frames
     assert frames.tolist() == [0, 1, 3, 4, 6, 7, 9, 10, 12, 13, 15]
-    expected = [(far if frame % 3 == 0 and frame else near)[frame] for frame in frames]
-    np.testing.assert_array_equal(run.boxes, expected)
+    np.testing.assert_array_equal(run.boxes, np.array(near)[frames])
+    assert run.departures == 0  # these are the frames of its first phase
+    assert run.disagreement == 0
+    run = replay_sequence(every, CLOCK, strided={Fraction(2): half})
+    np.testing.assert_array_equal(run.boxes, np.array(near)[frames])  # 15/10 is halfway: the lower
+    assert run.departures == 5
     assert run.disagreement == pytest.approx(5 / 11)
-    # 10, 12, 13 and 15 followed other boxes of 9, 10, 12 and 13 in their passes
-    assert run.departures == 4

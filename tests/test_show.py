@@ -74,7 +74,7 @@ def profiled() -> tuple[Metadata, list[Recording]]:
     metadata = Metadata.new(
         "30",
         "every-frame",
-        schedule={"policy": None, "pre_forecaster": None, "stride": 1},
+        schedule={"policy": None, "pre_forecaster": None, "stride": "2"},
         tracker={
             "name": "nanotrack",
             "version": "2",
@@ -125,7 +125,7 @@ def test_everything_that_a_profile_says_is_shown(
         "device NVIDIA Jetson Orin Nano, memory 8.0 GiB, power mode 15W (nvpmodel 0)",
         "cpu Cortex-A78AE, cores 6",
         "timing measured, clock perf_counter_ns, cpu share 1.87, synchronised, threads 2, warmup",
-        "schedule every-frame, stride 1",
+        "schedule every-frame, stride 2",
         "dataset DTB70",
         "lae sim commit abababababab..., modified, version 0.2.0",
         "2,000 in 20 sequences at 30 fps; all processed; 1,980 truths; 640x360 px; target not "
