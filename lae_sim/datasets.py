@@ -124,7 +124,7 @@ def _without_truth(
         if not paths:
             raise LaeError(f"{root}: no images there; --box needs a folder of images, or a video")
         read, length = partial(_read, sequence, paths), len(paths)
-    truth = _only_first(np.array([box], np.float64), length, "--box")
+    truth = _only_first(np.array([box], np.float64), length)
     return Dataset(name or sequence, fps or Fraction(30), [ImageSequence(sequence, truth, read)])
 
 
@@ -132,7 +132,7 @@ def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) ->
     truth = read_truth(file)
     paths, first = _find_images(root, name, file)
     if len(truth) == 1:
-        truth = _only_first(truth, len(paths), str(file))
+        truth = _only_first(truth, len(paths))
     if len(paths) > len(truth):
         number = first or _OTB_FIRST.get((name, len(truth)))
         paths = _part(paths, number, len(truth), f"{paths[0].parent}, sequence {name!r}")
@@ -141,7 +141,6 @@ def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) ->
             f"sequence {name!r}: {len(paths)} images in {paths[0].parent}, but {len(truth)} "
             f"annotations in {file}"
         )
-    _check_first(truth, str(file))
     return ImageSequence(name, truth, partial(_read, name, paths), attributes)
 
 
@@ -210,17 +209,10 @@ def _read(name: str, paths: list[Path], frame: int) -> Image:
         raise LaeError(f"sequence {name!r}, frame {frame}: {error}") from error
 
 
-def _only_first(first: Floats, length: int, where: str) -> Floats:
+def _only_first(first: Floats, length: int) -> Floats:
     truth = np.full((max(length, 1), 4), np.nan)
     truth[0] = first[0]
-    _check_first(truth, where)
     return truth
-
-
-def _check_first(truth: Floats, where: str) -> None:
-    if not (np.isfinite(truth[0]).all() and (truth[0, 2:] > 0).all()):
-        box = ",".join(f"{value:g}" for value in truth[0])
-        raise LaeError(f"{where}: the first box, {box}, is none: it needs a width and a height")
 
 
 def _choose(

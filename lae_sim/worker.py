@@ -159,7 +159,8 @@ class Worker(_Asked):
             self._start()
         if "frame" in question:
             question["shape"] = self._hand_over(question.pop("frame"))
-        return self._exchange(do, self._timeout, question)
+        limit = self._setup_timeout if do == "describe" else self._timeout
+        return self._exchange(do, limit, question)
 
     def _hand_over(self, frame: Image) -> tuple[int, ...]:
         if frame.nbytes > len(self._memory):

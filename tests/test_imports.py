@@ -28,7 +28,7 @@ LAYERS = [
     {"errors"},
     {"clock", "boxes"},
     {"engine"},
-    {"policies", "recording"},
+    {"policies", "recording", "strides"},
     {"latency", "pairing", "kalman", "forecast", "metrics", "arrow", "metadata", "files"},
     {"rows", "checks"},
     {"trace"},

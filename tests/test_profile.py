@@ -383,10 +383,10 @@ def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
     assert process.returncode == 0, err
     (report,) = json.loads(out)["traces"]
     assert report["strided"] == list(passes[1:])
-    # this tracker answers alike in all passes, so each output follows the one it followed there
+    # steps of 1 and 2 by turns are nearest to every frame, and the tracker answers alike
     for row in report["results"][0]["per_sequence"]:
-        assert row["disagreement"] == row["approximate_outputs"] == 0
-    assert report["exact"]
+        assert row["disagreement"] == 0 < row["approximate_outputs"]
+    assert not report["exact"]
     profile(here, *options[:-1], "u.parquet", "--option", "reach=9")
     process = start(here, "u.parquet", *arguments[1:], module="fidelity")
     _, err = process.communicate(timeout=120)
