@@ -164,8 +164,11 @@ class Worker(_Asked):
 
     def _hand_over(self, frame: Image) -> tuple[int, ...]:
         if frame.nbytes > len(self._memory):
-            os.truncate(self._frames.fileno(), frame.nbytes)
-            self._memory = mmap.mmap(self._frames.fileno(), frame.nbytes)
+            try:
+                os.truncate(self._frames.fileno(), frame.nbytes)
+                self._memory = mmap.mmap(self._frames.fileno(), frame.nbytes)
+            except OSError as error:
+                raise LaeError(f"no shared memory for a frame: {error.strerror}") from error
         shared = np.frombuffer(self._memory, np.uint8, frame.size).reshape(frame.shape)
         np.copyto(shared, frame)
         return frame.shape
