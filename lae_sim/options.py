@@ -94,6 +94,31 @@ def parse_latency(text: str) -> LatencySource:
     )
 
 
+def parse_box(text: str) -> tuple[float, ...]:
+    """A box ``x,y,w,h`` in pixels.
+
+    Raises:
+        LaeError: if the text is none.
+    """
+    try:
+        x, y, w, h = (float(value) for value in text.split(","))
+    except ValueError as error:
+        raise LaeError(f"{text!r} is not a box x,y,w,h in pixels") from error
+    return x, y, w, h
+
+
+def parse_stride(text: str) -> Fraction:
+    """A stride of a pass, such as ``2`` or ``3/2``.
+
+    Raises:
+        LaeError: if the text is none.
+    """
+    stride = parse_rational(text)
+    if not (stride > 1 and stride.numerator <= 1000):
+        raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {text!r}")
+    return stride
+
+
 def load_forecaster(name: str) -> ForecasterFactory:
     """A forecaster by its name, or a user's own as ``package.module:factory``.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -155,7 +156,7 @@ def run_pass(
     """
     failures = []
     finished = set(journal.finished(task.name))
-    cold, read_at = True, time.monotonic()
+    cold, read_at = True, -math.inf
     for order, sequence in enumerate(dataset.sequences):
         left = len(sequence) * task.rounds
 

@@ -5,17 +5,16 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
-from fractions import Fraction
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
 from lae_sim.cli import argument, exit_status
-from lae_sim.clock import NS_PER_SECOND, parse_duration, parse_fps, parse_rational
+from lae_sim.clock import NS_PER_SECOND, parse_duration, parse_fps
 from lae_sim.errors import LaeError
-from lae_sim.options import load_forecaster, parse_policy
+from lae_sim.options import load_forecaster, parse_box, parse_policy, parse_stride
 
 if TYPE_CHECKING:
     from lae_sim.frames import Dataset, ImageSequence
@@ -100,7 +99,7 @@ def parser() -> argparse.ArgumentParser:
         help="folder of the dataset, or a video (default: synthetic)",
     )
     add("--sequence", nargs="+", action="extend", metavar="NAME", help="these sequences only")
-    add("--box", type=argument(_box), metavar="X,Y,W,H", help="first box, for a video")
+    add("--box", type=argument(parse_box), metavar="X,Y,W,H", help="first box, for a video")
     add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the dataset's)")
     group = made.add_argument_group("the run")
     add = group.add_argument
@@ -122,7 +121,7 @@ def parser() -> argparse.ArgumentParser:
         "--stride",
         nargs="+",
         action="extend",
-        type=argument(_stride),
+        type=argument(parse_stride),
         default=[],
         metavar="N",
         help="further passes on every N-th frame (3/2: two of three), which make replays closer",
@@ -167,7 +166,7 @@ def _profile(arguments: argparse.Namespace) -> int:
 
     from lae_sim.datasets import find_dataset
     from lae_sim.journal import Journal
-    from lae_sim.passes import run_pass, summary, write_pass
+    from lae_sim.passes import run_pass, summary, warm_up, write_pass
 
     dataset = find_dataset(
         arguments.dataset, arguments.root, arguments.sequence, arguments.box, arguments.fps
@@ -180,6 +179,8 @@ def _profile(arguments: argparse.Namespace) -> int:
     failures: dict[str, list[dict[str, Any]]] = {}
     interrupted = False
     with closing(_tracker(arguments)) as tracker:
+        with suppress(LaeError):  # a tracker may import libraries, or reach the GPU, only now
+            warm_up(tracker, dataset.sequences[0], min(arguments.warmup, 1))
         passes = _passes(arguments, dataset, tracker, out)
         journal = Journal(unfinished, _settings(arguments, tracker), arguments.resume)
         total = sum(map(len, dataset.sequences)) * sum(task.rounds for task in passes)
@@ -373,21 +374,6 @@ def _key_and_value(text: str) -> tuple[str, str]:
     if not (equals and key.isidentifier()):
         raise LaeError(f"{text!r} is not key=value")
     return key, value
-
-
-def _box(text: str) -> tuple[float, ...]:
-    try:
-        x, y, w, h = (float(value) for value in text.split(","))
-    except ValueError as error:
-        raise LaeError(f"{text!r} is not a box x,y,w,h in pixels") from error
-    return x, y, w, h
-
-
-def _stride(text: str) -> Fraction:
-    stride = parse_rational(text)
-    if not (stride > 1 and stride.numerator <= 1000):
-        raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {text!r}")
-    return stride
 
 
 def _whole(text: str, least: int = 0) -> int:
