@@ -14,6 +14,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
+from lae_sim import errors
 from lae_sim.errors import LaeError
 
 _PACKAGES = {
@@ -77,20 +78,14 @@ def import_from(checkout: Path, module: str) -> types.ModuleType:
 
 @contextmanager
 def explained(what: str) -> Iterator[None]:
-    """Turn whatever other people's code raises into a LaeError that begins with ``what``."""
-    try:
-        yield
-    except LaeError:
-        raise
-    except ImportError as error:
-        module = (error.name or "").partition(".")[0]
-        if not isinstance(error, ModuleNotFoundError) or not module:
-            raise LaeError(f"{what}: {error}") from error
-        package = _PACKAGES.get(module, module)
-        raise LaeError(f"{what}: it needs {module}: pip install {package}") from error
-    except Exception as error:
-        text = " ".join(str(error).split())
-        raise LaeError(f"{what}: {type(error).__name__}: {text[:300]}") from error
+    """As :func:`lae_sim.errors.explained`, and name the package of a missing module."""
+    with errors.explained(what):
+        try:
+            yield
+        except ModuleNotFoundError as error:
+            module = (error.name or "").partition(".")[0]
+            package = _PACKAGES.get(module, module)
+            raise LaeError(f"{what}: it needs {module}: pip install {package}") from error
 
 
 @contextmanager
