@@ -136,6 +136,8 @@ def _compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
     every, *strided = (read_trace(other, names) for other in [arguments.trace, *arguments.strided])
     for trace in (every, *strided):
         _check_same_tracker(closed, trace)
+        if trace.metadata.kind != "every-frame":
+            raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
     schedule = closed.metadata.document["schedule"]
     policy, at_arrival = parse_policy(schedule.get("policy", "latest"))
     forecasters = {name: load_forecaster(name) for name in arguments.forecaster}

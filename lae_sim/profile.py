@@ -167,6 +167,7 @@ def _profile(arguments: argparse.Namespace) -> int:
     from lae_sim.datasets import find_dataset
     from lae_sim.journal import Journal
     from lae_sim.passes import run_pass, summary, warm_up, write_pass
+    from lae_sim.trace import read_trace
 
     dataset = find_dataset(
         arguments.dataset, arguments.root, arguments.sequence, arguments.box, arguments.fps
@@ -174,8 +175,15 @@ def _profile(arguments: argparse.Namespace) -> int:
     out = _out(arguments, dataset.name)
     unfinished = out.with_suffix(".unfinished")
     if arguments.resume and out.exists() and not unfinished.exists():
-        print(f"{out} is complete: there is nothing to resume", file=sys.stderr)
+        held = read_trace(out).metadata
+        print(
+            f"{PROGRAM}: {out} is complete ({held.tracker} on {held.dataset}): nothing to resume; "
+            "remove it to profile anew",
+            file=sys.stderr,
+        )
         return 0
+    if out.exists() and not arguments.resume:
+        print(f"{PROGRAM}: {out} will be replaced", file=sys.stderr)
     failures: dict[str, list[dict[str, Any]]] = {}
     interrupted = False
     with closing(_tracker(arguments)) as tracker:
@@ -253,6 +261,8 @@ def _tracker(arguments: argparse.Namespace) -> TimedTracker:
             timeout=arguments.frame_timeout / NS_PER_SECOND,
         )
     needed = arguments.pre_forecaster is not None and not tracker.sets_search
+    if needed:
+        print(f"{PROGRAM}: the tracker has no set_search, so frames are shifted", file=sys.stderr)
     return Translated(tracker) if arguments.translate or needed else tracker
 
 
@@ -274,6 +284,8 @@ def _passes(
     )
     if mode == "every-frame" and (arguments.policy or arguments.timing):
         raise LaeError("--policy and --timing are for --mode real-time")
+    if mode == "real-time" and (arguments.stride or arguments.closed_loop):
+        raise LaeError("--stride and --closed-loop go with --mode every-frame")
     includes = "init and track calls" + (
         " and the decoding of frames" if arguments.include_decode else "; frames decoded before"
     )

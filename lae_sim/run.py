@@ -24,9 +24,10 @@ class Run:
     """One sequence replayed.
 
     Attributes:
-        recording: the sequence as recorded, in the pass that the boxes are taken from.
+        recording: the sequence as recorded.
         schedule: what was processed, and when.
-        boxes: the box of each processed frame, float64 [n, 4].
+        boxes: the box of each processed frame, float64 [n, 4]; with strided passes perhaps of
+            another pass than the recording.
         departures: processed frames (the first left out) whose preceding processed frame is not
             the one they followed when they were recorded. Above 0, the boxes of a stateful tracker
             are an approximation: it would have seen other motion.
@@ -82,7 +83,7 @@ def replay_sequence(
     )
     frames = schedule.frames
     if strided:
-        return _from_passes({stride: recording, **strided}, schedule)
+        return _from_passes(recording, {stride: recording, **strided}, schedule)
     boxes = _boxes(recording, frames)
     return Run(recording, schedule, boxes, _departures(recording, frames, stride))
 
@@ -109,15 +110,17 @@ def _departures(recording: Recording, frames: Ints, stride: Fraction) -> int:
     return int(np.count_nonzero(before != frames[:-1]))
 
 
-def _from_passes(passes: Mapping[Fraction, Recording], schedule: Schedule) -> Run:
+def _from_passes(
+    recording: Recording, passes: Mapping[Fraction, Recording], schedule: Schedule
+) -> Run:
     """The run whose boxes come from the pass that is nearest to its mean step."""
     frames = schedule.frames
     step = Fraction(int(frames[-1]), max(len(frames) - 1, 1))
     strides = sorted(passes)
     nearest = min(range(len(strides)), key=lambda k: abs(strides[k] - step))
-    recording = passes[strides[nearest]]
-    boxes = _boxes(recording, frames)
-    departures = _departures(recording, frames, strides[nearest])
+    source = passes[strides[nearest]]
+    boxes = _boxes(source, frames)
+    departures = _departures(source, frames, strides[nearest])
     parted = np.zeros(len(frames), bool)
     for stride in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
         parted |= iou(_boxes(passes[stride], frames), boxes) < PARTED_IOU

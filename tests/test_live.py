@@ -18,6 +18,7 @@ from lae_sim.errors import LaeError
 from lae_sim.forecast import ConstantVelocity
 from lae_sim.frames import ImageSequence
 from lae_sim.kalman import Kalman
+from lae_sim.latency import constant
 from lae_sim.live import LiveRun, run_every_frame, run_real_time, search_of
 from lae_sim.metadata import Metadata
 from lae_sim.policies import every, fifo, latest, listed, shrinking_tail, vot_realtime
@@ -332,3 +333,6 @@ def test_passes_that_part_are_told() -> None:
     np.testing.assert_array_equal(run.boxes, np.array(near)[frames])  # 15/10 is halfway: the lower
     assert run.departures == 5
     assert run.disagreement == pytest.approx(5 / 11)
+    run = replay_sequence(every, CLOCK, constant(70_000_000), strided={Fraction(2): half})
+    np.testing.assert_array_equal(run.boxes, np.array(far)[run.schedule.frames])
+    assert run.recording is every  # what is scored offline

@@ -14,8 +14,8 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from lae_sim import errors
 from lae_sim.errors import LaeError
+from lae_sim.errors import explained as raised
 
 _PACKAGES = {
     "cv2": "opencv-python",
@@ -79,7 +79,7 @@ def import_from(checkout: Path, module: str) -> types.ModuleType:
 @contextmanager
 def explained(what: str) -> Iterator[None]:
     """As :func:`lae_sim.errors.explained`, and name the package of a missing module."""
-    with errors.explained(what):
+    with raised(what):
         try:
             yield
         except ModuleNotFoundError as error:

@@ -52,6 +52,11 @@ class Stopwatch:
     ) -> None:
         self._threads = threads
         self._tracker: Any = _explained(make_tracker, tracker, options)
+        for name in ("init", "track"):
+            if not callable(getattr(self._tracker, name, None)):
+                raise LaeError(
+                    f"tracker {tracker!r} has no method {name}(): it needs init and track"
+                )
         self._sync: Callable[[], object] = getattr(self._tracker, "sync", _cuda_at_rest)
         self._started = False
         self.sets_search = hasattr(self._tracker, "set_search")
