@@ -31,6 +31,7 @@ from lae_sim import (
     write_trace,
 )
 from lae_sim.forecast import Lanes
+from lae_sim.kalman import filter_lanes
 from lae_sim.report import table
 
 SEQUENCES, FRAMES = 123, 112_578
@@ -205,7 +206,7 @@ def kalman_lines(rounds: int) -> list[list[str]]:
 
     found = medians({"one at a time": streaming, "filterpy": filterpy}, rounds)
     found[f"{lanes:,} lanes at once"] = (
-        medians({"": lambda: Kalman.run_lanes(many)}, rounds)[""] / lanes
+        medians({"": lambda: filter_lanes(many)}, rounds)[""] / lanes
     )
     return lines("kalman", found, "filterpy", count, "us per update")
 

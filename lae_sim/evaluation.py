@@ -17,7 +17,7 @@ import numpy.typing as npt
 from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
-from lae_sim.forecast import ForecasterFactory, Lanes, forecast, own
+from lae_sim.forecast import AnyFactory, Lanes, SequenceFactory, forecast, own
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import (
     METRICS,
@@ -89,7 +89,7 @@ class Evaluation:
 def evaluate(
     runs: Iterable[Run],
     metadata: Metadata,
-    forecasters: Mapping[str, ForecasterFactory],
+    forecasters: Mapping[str, AnyFactory],
     sigmas: Sequence[Fraction] = (Fraction(0),),
     convention: Convention = PYSOT,
     at_arrival: bool = False,
@@ -121,7 +121,7 @@ def evaluate(
 def _evaluate_group(
     runs: Sequence[Run],
     metadata: Metadata,
-    forecasters: Mapping[str, ForecasterFactory],
+    forecasters: Mapping[str, AnyFactory],
     sigmas: Sequence[Fraction],
     convention: Convention,
     at_arrival: bool,
@@ -177,7 +177,7 @@ def answers(
     run: Run,
     metadata: Metadata,
     name: str,
-    factory: ForecasterFactory,
+    factory: AnyFactory,
     sigma: Fraction = Fraction(0),
     at_arrival: bool = False,
 ) -> Answers:
@@ -192,7 +192,7 @@ def _answers(
     metadata: Metadata,
     pairing: Pairing,
     name: str,
-    factory: ForecasterFactory,
+    factory: AnyFactory,
 ) -> tuple[Histories, Pairs, Floats]:
     """The distinct pairs of a forecaster with their boxes, float64 [P, 4]."""
     fed = histories(pairing, memoryless=own(factory, "memoryless"))
@@ -205,7 +205,16 @@ def _answers(
         boxes[fed.output],
         np.array(sizes, np.float64)[fed.sequence],
     )
-    return fed, found, forecast(factory, lanes, found.item, found.frame, name)
+    if not isinstance(factory, SequenceFactory):
+        return fed, found, forecast(factory, lanes, found.item, found.frame, name)
+    parts = []
+    for s, run in enumerate(runs):
+        first, last = np.searchsorted(fed.sequence, [s, s + 1])
+        low, high = np.searchsorted(found.item, fed.offsets[[first, last]])
+        item, frame = found.item[low:high] - fed.offsets[first], found.frame[low:high]
+        own_factory = factory.for_sequence(run.recording)
+        parts.append(forecast(own_factory, lanes.part(first, last), item, frame, name))
+    return fed, found, np.concatenate(parts)
 
 
 class _Scorer:

@@ -58,26 +58,64 @@ class Lanes:
     boxes: Floats
     image_sizes: Floats
 
+    def lane(self, item: Ints) -> Ints:
+        """The lane of each item, int64 [P]."""
+        found: Ints = np.searchsorted(self.offsets, item, "right") - 1
+        return found
 
-@dataclass(frozen=True)
-class Motion:
-    """State after each item of the lanes, extrapolated linearly: float64 [N, 4] each.
+    def first(self, item: Ints) -> Ints:
+        """The first item of each item's lane, int64 [P]."""
+        first: Ints = self.offsets[self.lane(item)]
+        return first
 
-    Attributes:
-        position: box at the item's frame, pixels.
-        velocity: change of the box, pixels per frame.
-    """
-
-    position: Floats
-    velocity: Floats
+    def part(self, begin: int, end: int) -> Lanes:
+        """Some consecutive lanes, whose items then count from 0."""
+        items = slice(self.offsets[begin], self.offsets[end])
+        return Lanes(
+            self.offsets[begin : end + 1] - self.offsets[begin],
+            self.frames[items],
+            self.boxes[items],
+            self.image_sizes[begin:end],
+        )
 
 
 @runtime_checkable
 class LaneFactory(Protocol):
-    """A factory that can also run many lanes at once, for forecasts linear in time."""
+    """A factory that can also answer for many lanes at once, faster than box after box."""
 
-    def run_lanes(self, lanes: Lanes) -> Motion:
-        """State after each item of every lane."""
+    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+        """Boxes for some frames, float64 [P, 4], each as of one of the lanes' items.
+
+        The arguments are those of :func:`forecast`.
+        """
+
+
+class Sequenced(Protocol):
+    """What a recording and an image sequence have in common."""
+
+    @property
+    def name(self) -> str:
+        """The sequence's name."""
+
+    @property
+    def truth(self) -> Floats:
+        """Ground truth, float64 [T, 4]; NaN where there is none."""
+
+
+@runtime_checkable
+class SequenceFactory(Protocol):
+    """A maker of factories for those that must know which sequence it is: its truth, its frames."""
+
+    def for_sequence(self, sequence: Sequenced) -> ForecasterFactory:
+        """The factory for one sequence."""
+
+
+AnyFactory = ForecasterFactory | SequenceFactory
+
+
+def factory_for(factory: AnyFactory, sequence: Sequenced) -> ForecasterFactory:
+    """The factory of a sequence's forecasters."""
+    return factory.for_sequence(sequence) if isinstance(factory, SequenceFactory) else factory
 
 
 class Hold:
@@ -97,9 +135,10 @@ class Hold:
         return self._box
 
     @staticmethod
-    def run_lanes(lanes: Lanes) -> Motion:
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
         """The same for many lanes at once."""
-        return Motion(lanes.boxes, np.zeros_like(lanes.boxes))
+        boxes: Floats = lanes.boxes[item]
+        return boxes
 
 
 class ConstantVelocity:
@@ -122,17 +161,17 @@ class ConstantVelocity:
         return [p + interval * v for p, v in zip(self._box, self._velocity)]
 
     @staticmethod
-    def run_lanes(lanes: Lanes) -> Motion:
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
         """The same for many lanes at once; equal bit for bit."""
-        velocity = np.zeros_like(lanes.boxes)
-        interval = np.diff(lanes.frames).astype(np.float64)
-        interval[lanes.offsets[1:-1] - 1] = np.inf  # between two lanes
-        velocity[1:] = np.diff(lanes.boxes, axis=0) / interval[:, None]
-        velocity[lanes.offsets[:-1]] = 0.0
-        return Motion(lanes.boxes, velocity)
+        before = np.maximum(item - 1, lanes.first(item))
+        interval = np.maximum(lanes.frames[item] - lanes.frames[before], 1).astype(np.float64)
+        velocity = (lanes.boxes[item] - lanes.boxes[before]) / interval[:, None]
+        ahead = (frame - lanes.frames[item]).astype(np.float64)
+        boxes: Floats = lanes.boxes[item] + ahead[:, None] * velocity
+        return boxes
 
 
-def own(factory: ForecasterFactory, name: str) -> bool:
+def own(factory: AnyFactory, name: str) -> bool:
     """Whether a factory's class itself has an attribute.
 
     What it inherits does not count: a subclass may have changed the methods that a shortcut of its
@@ -159,27 +198,24 @@ def forecast(
     Raises:
         LaeError: if a forecaster fails, or answers anything but four finite numbers.
     """
-    lane = np.searchsorted(lanes.offsets, item, "right") - 1
-    if own(factory, "run_lanes") and isinstance(factory, LaneFactory):
-        motion = factory.run_lanes(lanes)
-        interval = (frame - lanes.frames[item]).astype(np.float64)
-        boxes: Floats = motion.position[item] + interval[:, None] * motion.velocity[item]
-        finish = getattr(factory, "finish", None)
-        return (
-            boxes if finish is None else finish(boxes, lanes.boxes[item], lanes.image_sizes[lane])
-        )
     with explained(name):
-        return _streamed(factory, lanes, item, frame, lane, name)
+        if own(factory, "forecast_lanes") and isinstance(factory, LaneFactory):
+            boxes = factory.forecast_lanes(lanes, item, frame)
+            if not np.isfinite(boxes).all():
+                wrong = int(np.argmin(np.isfinite(boxes).all(axis=1)))
+                raise LaeError(f"predicted {boxes[wrong]} for frame {frame[wrong]}, not a box")
+            return boxes
+        return _streamed(factory, lanes, item, frame, name)
 
 
 def _streamed(
-    factory: ForecasterFactory, lanes: Lanes, item: Ints, frame: Ints, lane: Ints, name: str
+    factory: ForecasterFactory, lanes: Lanes, item: Ints, frame: Ints, name: str
 ) -> Floats:
     """The forecasts of forecasters that are fed one box after another."""
     answers = np.empty((len(item), 4))
     fed, current = -1, -1
     forecaster: Any = None
-    for p, (i, k) in enumerate(zip(item.tolist(), lane.tolist())):
+    for p, (i, k) in enumerate(zip(item.tolist(), lanes.lane(item).tolist())):
         if k != current:
             current, fed = k, int(lanes.offsets[k])
             size = lanes.image_sizes[k]

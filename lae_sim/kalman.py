@@ -3,82 +3,168 @@
 State [x, y, w, h, x', y', w', h'] with F(dt) = [[I, dt I], [0, I]], Q = dt^2 I, R = 10 I,
 H = [I, 0] and P0 = 100 I (the last is not in the paper; the released code has it). With these
 matrices the covariance stays [[a I, b I], [b I, c I]]: four coordinates share three scalars, and
-the gain depends on the intervals alone.
+the gain depends on the intervals alone. That holds for any multiples of those matrices and for a
+velocity that decays, so the family :class:`TunedKalman` runs on the same code.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from lae_sim.boxes import Floats, iou
-from lae_sim.forecast import ImageSize, Lanes, Motion
+from lae_sim.engine import Ints
+from lae_sim.errors import LaeError
+from lae_sim.forecast import ImageSize, Lanes
 
-MEASUREMENT_VARIANCE = 10.0
-INITIAL_VARIANCE = 100.0
 RESTART_IOU = 0.3
 LEAST_AREA = 75
 
 Number = TypeVar("Number", float, Floats)
+Covariance = tuple[Number, Number, Number]
 
 
-def gain(
-    a: Number, b: Number, c: Number, interval: Number
-) -> tuple[Number, Number, Number, Number, Number]:
-    """Predict the covariance over an interval and update it with a measurement.
+@dataclass(frozen=True)
+class TunedKalman:
+    """The paper's filter with other numbers in its place: a factory; the defaults are the paper's.
 
-    Args:
-        a, b, c: covariance of a position with itself, with its velocity, and of the velocity.
-        interval: dt in frames.
-
-    Returns:
-        The new a, b, c, and the gains of position and velocity (Eqs. 7-9).
+    Attributes:
+        q: process noise; Q = q dt^2 I.
+        r: measurement noise; R = r I.
+        p0: initial covariance; P0 = p0 I.
+        decay: what is left of the velocity after one frame, above 0 to 1: a damped trend (Gardner
+            and McKenzie, "Forecasting Trends in Time Series", 1985, Eq. 1).
+        state: ``"corner"`` is x, y, w, h; ``"centre"`` is the centre, the logarithm of the scale
+            sqrt(w h) and that of the aspect w / h. The gains do not depend on the units, so both
+            states share them.
     """
-    noise = interval * interval
-    a = a + 2.0 * interval * b + noise * c + noise
-    b = b + interval * c
-    c = c + noise
-    position = a / (a + MEASUREMENT_VARIANCE)
-    velocity = b / (a + MEASUREMENT_VARIANCE)
-    return a - position * a, b - position * b, c - velocity * b, position, velocity
+
+    q: float = 1.0
+    r: float = 10.0
+    p0: float = 100.0
+    decay: float = 1.0
+    state: Literal["corner", "centre"] = "corner"
+
+    def __post_init__(self) -> None:
+        fits = [0 <= value < np.inf for value in (self.q, self.p0)]
+        if not (all(fits) and 0 < self.r < np.inf and 0 < self.decay <= 1):
+            raise LaeError("a Kalman filter needs q >= 0, r > 0, p0 >= 0 and 0 < decay <= 1")
+        if self.state not in ("corner", "centre"):
+            raise LaeError(f"a Kalman filter's state is corner or centre, not {self.state!r}")
+
+    def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Kalman:
+        """The filter of one sequence."""
+        return Kalman(box, image_size, self)
+
+    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+        """The same for many lanes at once."""
+        position, velocity = filter_lanes(lanes, self)
+        reach = self.reach((frame - lanes.frames[item]).astype(np.float64))
+        return self.boxes(position[item] + reach[:, None] * velocity[item])
+
+    def reach(self, interval: Number) -> Number:
+        """How many frames' velocity an interval of so many frames is worth."""
+        if self.decay == 1:
+            return interval
+        worth: Number = (1 - self.decay**interval) / (1 - self.decay)
+        return worth
+
+    def gain(
+        self, covariance: Covariance[Number], interval: Number
+    ) -> tuple[Covariance[Number], Number, Number]:
+        """Predict the covariance over an interval and update it with a measurement.
+
+        Args:
+            covariance: of a position with itself, with its velocity, and of the velocity.
+            interval: dt in frames.
+
+        Returns:
+            The new covariance, and the gains of position and velocity (Eqs. 7-9).
+        """
+        a, b, c = covariance
+        keep, reach = self.decay**interval, self.reach(interval)
+        noise = self.q * (interval * interval)
+        a = a + 2.0 * reach * b + reach * reach * c + noise
+        b = keep * (b + reach * c)
+        c = keep * keep * c + noise
+        position = a / (a + self.r)
+        velocity = b / (a + self.r)
+        return (a - position * a, b - position * b, c - velocity * b), position, velocity
+
+    def states(self, boxes: Floats) -> Floats:
+        """Boxes as positions of the filter's state, float64 [n, 4]."""
+        if self.state == "corner":
+            return boxes
+        sides = np.log(np.maximum(boxes[:, 2:], 1.0))
+        scale, aspect = sides.sum(axis=1) / 2, sides[:, 0] - sides[:, 1]
+        return np.column_stack([boxes[:, :2] + boxes[:, 2:] / 2, scale, aspect])
+
+    def boxes(self, states: Floats) -> Floats:
+        """The inverse of :meth:`states`."""
+        if self.state == "corner":
+            return states
+        scale, half = states[:, 2], states[:, 3] / 2
+        sides = np.exp(np.clip(np.column_stack([scale + half, scale - half]), -20, 20))
+        return np.concatenate([states[:, :2] - sides / 2, sides], axis=1)
+
+
+PAPER = TunedKalman()
 
 
 class Kalman:
-    """The paper's filter, exactly."""
+    """The paper's filter, exactly; or another of its family."""
 
-    def __init__(self, box: Sequence[float], image_size: ImageSize = None) -> None:
+    def __init__(
+        self,
+        box: Sequence[float],
+        image_size: ImageSize = None,
+        settings: TunedKalman = PAPER,
+    ) -> None:
+        self._settings = settings
         self._restart(0, box)
 
     def _restart(self, frame: int, box: Sequence[float]) -> None:
         self._frame = frame
-        self._position = [float(value) for value in box]
+        self._position = self._measured(box)
         self._velocity = [0.0] * 4
-        self._covariance = INITIAL_VARIANCE, 0.0, INITIAL_VARIANCE
+        self._covariance = self._settings.p0, 0.0, self._settings.p0
+
+    def _measured(self, box: Sequence[float]) -> list[float]:
+        if self._settings.state == "corner":
+            return [float(value) for value in box]
+        state: list[float] = self._settings.states(np.array([box], np.float64))[0].tolist()
+        return state
 
     def _extrapolate(self, frame: int) -> list[float]:
-        interval = float(frame - self._frame)
-        return [p + interval * v for p, v in zip(self._position, self._velocity)]
+        reach = self._settings.reach(float(frame - self._frame))
+        return [p + reach * v for p, v in zip(self._position, self._velocity)]
 
     def update(self, frame: int, box: Sequence[float]) -> None:
         """Take in the box of a newer frame."""
-        a, b, c, position, velocity = gain(*self._covariance, float(frame - self._frame))
-        self._covariance = a, b, c
+        interval = float(frame - self._frame)
         predicted = self._extrapolate(frame)
-        errors = [measured - p for measured, p in zip(box, predicted)]
+        self._covariance, position, velocity = self._settings.gain(self._covariance, interval)
+        kept = self._settings.decay**interval
+        errors = [measured - p for measured, p in zip(self._measured(box), predicted)]
         self._position = [p + position * error for p, error in zip(predicted, errors)]
-        self._velocity = [v + velocity * error for v, error in zip(self._velocity, errors)]
+        self._velocity = [kept * v + velocity * e for v, e in zip(self._velocity, errors)]
         self._frame = frame
 
     def predict(self, frame: int) -> Sequence[float]:
         """The box at a frame, from the boxes so far."""
-        return self._extrapolate(frame)
+        predicted = self._extrapolate(frame)
+        if self._settings.state == "corner":
+            return predicted
+        box: list[float] = self._settings.boxes(np.array([predicted]))[0].tolist()
+        return box
 
     @staticmethod
-    def run_lanes(lanes: Lanes) -> Motion:
-        """The same filter over many lanes at once; equal bit for bit."""
-        return _filter_lanes(lanes, restart_iou=None)
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+        """The paper's filter over many lanes at once; equal bit for bit."""
+        return PAPER.forecast_lanes(lanes, item, frame)
 
 
 class KalmanLaePvt(Kalman):
@@ -111,14 +197,12 @@ class KalmanLaePvt(Kalman):
         return answer
 
     @staticmethod
-    def run_lanes(lanes: Lanes) -> Motion:
-        """The same filter over many lanes at once; equal bit for bit."""
-        return _filter_lanes(lanes, restart_iou=RESTART_IOU)
-
-    @staticmethod
-    def finish(forecasts: Floats, raw: Floats, image_sizes: Floats) -> Floats:
-        """Clip forecasts to their images, or fall back to the raw boxes."""
-        return clip(forecasts, raw, image_sizes)
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+        """The same for many lanes at once; equal bit for bit."""
+        position, velocity = filter_lanes(lanes, PAPER, restart_iou=RESTART_IOU)
+        ahead = (frame - lanes.frames[item]).astype(np.float64)
+        forecasts = position[item] + ahead[:, None] * velocity[item]
+        return clip(forecasts, lanes.boxes[item], lanes.image_sizes[lanes.lane(item)])
 
 
 def clip(forecasts: Floats, raw: Floats, image_sizes: Floats) -> Floats:
@@ -141,34 +225,46 @@ def clip(forecasts: Floats, raw: Floats, image_sizes: Floats) -> Floats:
     return np.where(kept[:, None], np.concatenate([corner, size], axis=1), raw)
 
 
-def _filter_lanes(lanes: Lanes, restart_iou: float | None) -> Motion:
+def filter_lanes(
+    lanes: Lanes, settings: TunedKalman = PAPER, restart_iou: float | None = None
+) -> tuple[Floats, Floats]:
     """Filter all lanes in step: the k-th update of every lane that has one, for each k.
 
     Lanes are sorted by length, so that those still running are always the first ones.
+
+    Args:
+        lanes: what the filters are fed.
+        settings: the filter.
+        restart_iou: a measurement that overlaps its prediction by less restarts the filter there.
+
+    Returns:
+        Position and velocity of the state after each item, float64 [N, 4] each.
     """
     lengths = np.diff(lanes.offsets)
     order = np.argsort(-lengths, kind="stable")
     firsts, lengths = lanes.offsets[:-1][order], lengths[order]
-    position = lanes.boxes[firsts]
+    states = settings.states(lanes.boxes)
+    position = states[firsts]
     velocity = np.zeros_like(position)
-    a, b, c = (np.full(len(order), value) for value in (INITIAL_VARIANCE, 0.0, INITIAL_VARIANCE))
-    motion = Motion(lanes.boxes.copy(), np.zeros_like(lanes.boxes))
+    start = (settings.p0, 0.0, settings.p0)
+    a, b, c = (np.full(len(order), value) for value in start)
+    positions, velocities = states.copy(), np.zeros_like(states)
     running = np.searchsorted(-lengths, -np.arange(lengths[0]))  # lanes with more than k outputs
     for k in range(1, int(lengths[0])):
         n = int(running[k])
         item = firsts[:n] + k
         interval = (lanes.frames[item] - lanes.frames[item - 1]).astype(np.float64)
-        measured = lanes.boxes[item]
-        a_n, b_n, c_n, position_gain, velocity_gain = gain(a[:n], b[:n], c[:n], interval)
-        predicted = position[:n] + interval[:, None] * velocity[:n]
+        measured = states[item]
+        covariance, position_gain, velocity_gain = settings.gain((a[:n], b[:n], c[:n]), interval)
+        predicted = position[:n] + settings.reach(interval)[:, None] * velocity[:n]
+        kept = (settings.decay**interval)[:, None]
         error = measured - predicted
-        new_position = predicted + position_gain[:, None] * error
-        new_velocity = velocity[:n] + velocity_gain[:, None] * error
+        position[:n] = predicted + position_gain[:, None] * error
+        velocity[:n] = kept * velocity[:n] + velocity_gain[:, None] * error
+        a[:n], b[:n], c[:n] = covariance
         if restart_iou is not None:
             lost = np.flatnonzero(iou(predicted, measured) < restart_iou)
-            new_position[lost], new_velocity[lost] = measured[lost], 0.0
-            a_n[lost], b_n[lost], c_n[lost] = INITIAL_VARIANCE, 0.0, INITIAL_VARIANCE
-        position[:n], velocity[:n] = new_position, new_velocity
-        a[:n], b[:n], c[:n] = a_n, b_n, c_n
-        motion.position[item], motion.velocity[item] = new_position, new_velocity
-    return motion
+            position[lost], velocity[lost] = measured[lost], 0.0
+            a[lost], b[lost], c[lost] = start
+        positions[item], velocities[item] = position[:n], velocity[:n]
+    return positions, velocities

@@ -258,8 +258,6 @@ def test_vot_scores_each_output_at_its_own_frame() -> None:
 
 def test_a_forecaster_that_answers_nonsense_is_named() -> None:
     class Nonsense(ConstantVelocity):
-        run_lanes = None
-
         def predict(self, frame: int) -> list[float]:
             return [math.nan] * 4
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from witness import DenseKalman, DenseLaePvt, FilterpyKalman
 
 from lae_sim.forecast import Lanes
-from lae_sim.kalman import Kalman, KalmanLaePvt, clip
+from lae_sim.kalman import PAPER, RESTART_IOU, Kalman, KalmanLaePvt, clip, filter_lanes
 
 BOXES = st.tuples(*[st.floats(-1000, 3000)] * 2, *[st.floats(0.5, 900)] * 2)
 
@@ -119,7 +119,8 @@ def test_a_restart_needs_an_iou_strictly_below_0_3() -> None:
     for shift, restarts in ((7, False), (7.0625, True)):
         boxes = np.array([[0, 0, 10, 13], [0, shift, 10, 13]], float)
         lanes = Lanes(np.array([0, 2]), np.array([0, 1]), boxes, np.full((1, 2), np.inf))
-        assert (KalmanLaePvt.run_lanes(lanes).velocity[1] == 0).all() == restarts
+        _, velocity = filter_lanes(lanes, PAPER, RESTART_IOU)
+        assert (velocity[1] == 0).all() == restarts
     for wanted, restarts in ((0.29, True), (0.31, False)):
         model = KalmanLaePvt([0, 0, 100, 100])
         model.update(1, iou_case(wanted))
@@ -176,7 +177,7 @@ def test_without_an_image_size_nothing_is_clipped() -> None:
 def test_image_sizes_are_per_lane() -> None:
     box = [90.0, 10.0, 40.0, 40.0]
     lanes = np.array([[100, 100], [np.inf, np.inf], [120, 30]], float)
-    found = KalmanLaePvt.finish(np.array([box] * 3), np.array([box] * 3), lanes)
+    found = clip(np.array([box] * 3), np.array([box] * 3), lanes)
     assert found.tolist() == [[90, 10, 10, 40], box, [90, 10, 30, 20]]
 
 
@@ -186,11 +187,11 @@ def test_lanes_of_any_order_of_lengths_do_not_mix() -> None:
     offsets = np.cumsum([0, *lengths])
     frames = np.concatenate([np.arange(n) * 2 for n in lengths])
     boxes = random.uniform(10, 60, (offsets[-1], 4))
-    together = Kalman.run_lanes(Lanes(offsets, frames, boxes, np.full((6, 2), np.inf)))
+    together = filter_lanes(Lanes(offsets, frames, boxes, np.full((6, 2), np.inf)))
     for low, high in pairwise(offsets):
         part = Lanes(
             np.array([0, high - low]), frames[low:high], boxes[low:high], np.full((1, 2), np.inf)
         )
-        alone = Kalman.run_lanes(part)
-        assert alone.position.tobytes() == together.position[low:high].tobytes()
-        assert alone.velocity.tobytes() == together.velocity[low:high].tobytes()
+        alone = filter_lanes(part)
+        for one, all_ in zip(alone, together):
+            assert one.tobytes() == all_[low:high].tobytes()
