@@ -1,0 +1,94 @@
+"""Forecasters that look at the last few outputs only, one sequence or many at a time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from lae_sim.boxes import Bools, Floats
+from lae_sim.engine import Ints
+from lae_sim.forecast import ImageSize, Lanes
+
+
+@dataclass(frozen=True)
+class Window:
+    """The last n outputs before each of P forecasts, the newest first.
+
+    Attributes:
+        frames: frame of each, int64 [P, n].
+        boxes: box of each, float64 [P, n, 4].
+        known: whether there is such an output, bool [P, n]; where not, the oldest one is repeated.
+    """
+
+    frames: Ints
+    boxes: Floats
+    known: Bools
+
+    @classmethod
+    def of(cls, lanes: Lanes, item: Ints, size: int) -> Window:
+        """The last ``size`` outputs as of some items of the lanes."""
+        index = item[:, None] - np.arange(size)
+        first = lanes.first(item)[:, None]
+        kept = np.maximum(index, first)
+        return cls(lanes.frames[kept], lanes.boxes[kept], index >= first)
+
+
+class Rule(Protocol):
+    """A forecast from a window of outputs."""
+
+    @property
+    def size(self) -> int:
+        """Outputs that it looks at."""
+
+    def __call__(self, window: Window, ahead: Floats) -> Floats:
+        """Boxes, float64 [P, 4], so many frames [P] after the newest output of each window."""
+
+
+@dataclass(frozen=True)
+class Windowed:
+    """The factory of forecasters that follow a rule.
+
+    Attributes:
+        rule: the forecast from the last outputs.
+    """
+
+    rule: Rule
+
+    def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> _Recent:
+        """The forecaster of one sequence."""
+        return _Recent(self, box)
+
+    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+        """The same for many lanes at once; equal but for rounding."""
+        ahead = (frame - lanes.frames[item]).astype(np.float64)
+        return self.rule(Window.of(lanes, item, self.rule.size), ahead)
+
+
+class _Recent:
+    """A forecaster that keeps the last outputs and applies the rule to them."""
+
+    def __init__(self, factory: Windowed, box: Sequence[float]) -> None:
+        self._factory = factory
+        self._outputs = deque([(0, box)], maxlen=factory.rule.size)
+
+    def update(self, frame: int, box: Sequence[float]) -> None:
+        """Take in the box of a newer frame."""
+        self._outputs.append((frame, box))
+
+    def predict(self, frame: int) -> Sequence[float]:
+        """The box at a frame, from the last boxes."""
+        frames, boxes = zip(*self._outputs)
+        count = len(frames)
+        lane = Lanes(
+            np.array([0, count]),
+            np.array(frames, np.int64),
+            np.array(boxes, np.float64),
+            np.full((1, 2), np.inf),
+        )
+        item, asked = np.array([count - 1]), np.array([frame])
+        answer: list[float] = self._factory.forecast_lanes(lane, item, asked)[0].tolist()
+        return answer
