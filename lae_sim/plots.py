@@ -75,7 +75,7 @@ def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str
         named: curves by name; for several traces the names are ``"trace: forecaster"``.
         title: above both plots.
     """
-    figure = _figure(10, 4.2)
+    figure = new_figure(10, 4.2)
     left, right = figure.subplots(1, 2)
     figure.suptitle(title)
     traces = list(dict.fromkeys(name.rpartition(": ")[0] for name in named))
@@ -122,7 +122,7 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
     clock = schedule.clock
     frame_ms = clock.milliseconds(1)
     end = min(first + count, schedule.length)
-    figure = _figure(12, 3.6)
+    figure = new_figure(12, 3.6)
     axes = figure.subplots()
     processed = set(schedule.frames.tolist())
     for frame in range(first, end):
@@ -169,7 +169,7 @@ def check_format(path: str) -> None:
     Raises:
         LaeError: if its ending is not known, or matplotlib is missing.
     """
-    if Path(path).suffix[1:].lower() not in _figure(1, 1).canvas.get_supported_filetypes():
+    if Path(path).suffix[1:].lower() not in new_figure(1, 1).canvas.get_supported_filetypes():
         raise LaeError(f"cannot draw to {path}: name a .png, .svg or .pdf file")
 
 
@@ -184,7 +184,7 @@ def save(figure: Figure, path: str) -> None:
         figure.savefig(temporary, format=Path(path).suffix[1:].lower(), dpi=150)
 
 
-def _figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float) -> Figure:
     """An empty figure, of its own: pyplot would keep a list of all."""
     try:
         from matplotlib.figure import Figure

@@ -1,0 +1,294 @@
+"""Statistics of a comparison: intervals, paired differences and tests, over sequences.
+
+Sequences are the independent observations; frames are not. Everything is computed in groups, one
+per trace, latency, scale, sigma and metric. All forecasters of a group are measured on the same
+sequences, and share the bootstrap's resamples, so that their differences are paired. The tidy table
+that goes in is described at :func:`lae_sim.comparison.compare`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lae_sim.boxes import Floats
+from lae_sim.errors import LaeError
+from lae_sim.report import table as text_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ALL_TRACES = "all traces"
+ALL_SEQUENCES = "all sequences"
+METRIC_LABELS = {"auc": "AUC", "dp20": "DP@20", "norm_dp20": "norm. P", "norm_auc": "norm. AUC"}
+_KEYS = ["attribute", "trace", "latency", "scale", "sigma", "forecaster", "metric"]
+_NOISE_DECIMALS = 12  # equal differences of scores in 0..1 are equal to this many decimals
+
+
+def summarise(
+    table: pd.DataFrame,
+    baselines: Sequence[str] = ("hold", "kalman"),
+    metrics: Sequence[str] = ("auc", "dp20"),
+    resamples: int = 10_000,
+    seed: int = 0,
+    confidence: float = 0.95,
+) -> pd.DataFrame:
+    """Means, differences and recovered losses with bootstrap intervals, and paired tests.
+
+    A sequence counts in a group if every forecaster of the group has a value there (``offline`` is
+    no forecaster: it has rows in a group only if it has values for all sequences that count). If
+    there are several traces, the rows of ``"all traces"`` come last: each sequence that counts is
+    averaged over its traces first.
+
+    Args:
+        table: the tidy table; a column ``attribute`` divides the groups further.
+        baselines: forecasters that the others are compared with, where the table has them.
+        metrics: those to summarise.
+        resamples: of the percentile bootstrap (Efron, "Bootstrap Methods: Another Look at the
+            Jackknife", 1979). A group's depend on ``seed`` and its number of sequences alone.
+        seed: of NumPy's PCG64.
+        confidence: of the intervals, between 0 and 1.
+
+    Returns:
+        One row per trace, latency, scale, sigma, forecaster and metric, each in the order of its
+        first appearance, with ``sequences`` (how many count), ``mean``, ``low``, ``high`` and:
+
+        - per baseline ``vs_hold``, ``vs_hold_low``, ``vs_hold_high`` (the mean paired difference),
+          ``vs_hold_p`` (:func:`signed_rank_p`), ``vs_hold_better``, ``vs_hold_worse`` (numbers of
+          sequences); NaN and 0 in a group without that baseline;
+        - ``recovered``, ``recovered_low``, ``recovered_high``: the share of the latency loss won
+          back, (forecast - hold) / (offline - hold) of the means. NaN without offline or a loss;
+          the interval is NaN if there is a resample without a loss.
+
+        With one sequence an interval is its value. ``attrs["method"]`` says how it was computed.
+
+    Raises:
+        LaeError: if the table lacks a column, has two values for the same thing, or no sequence
+            counts anywhere; or if a setting is out of its range.
+    """
+    import pandas as pd
+
+    if resamples < 1 or not 0 < confidence < 1:
+        raise LaeError("a bootstrap needs resamples >= 1 and 0 < confidence < 1")
+    baselines = [name for name in baselines if (table["forecaster"] == name).any()]
+    wide, order = _wide(table, metrics)
+    weights: dict[int, Floats] = {}
+    parts = []
+    keys = [key for key in order if key != "forecaster"]
+    for values, group in wide.groupby(keys, sort=False):
+        present = [name for name in order["forecaster"] if group[name].notna().any()]
+        group = group.dropna(subset=[name for name in present if name != "offline"])
+        present = [name for name in present if group[name].notna().all()]
+        count = len(group)
+        if not count or not present:
+            continue
+        if count not in weights:
+            weights[count] = _weights(count, resamples, seed)
+        scores = np.ascontiguousarray(group[present].to_numpy(np.float64).T)
+        columns = _compared(scores, present, weights[count], baselines, confidence)
+        columns = {"forecaster": present, "sequences": count, **columns}
+        parts.append(pd.DataFrame({**dict(zip(keys, values)), **columns}))
+    if not parts:
+        raise LaeError("nothing to summarise: no sequence has a value for every forecaster")
+    summary = pd.concat(parts)[[*order, *parts[0].columns.difference(list(order), sort=False)]]
+    summary = summary.sort_values(
+        list(order), key=lambda column: column.map(order[column.name].index), ignore_index=True
+    )
+    summary.attrs["method"] = (
+        f"[ ]: {100 * confidence:g} % percentile bootstrap over sequences, {resamples:,} "
+        f"resamples, seed {seed}; p: Wilcoxon's signed-rank test,\npaired over sequences, not "
+        "corrected for the number of comparisons; +/-: sequences better and worse; n: sequences"
+    )
+    return summary
+
+
+def by_attribute(
+    table: pd.DataFrame, attributes: Mapping[tuple[str, str], Iterable[str]], **settings: Any
+) -> pd.DataFrame:
+    """:func:`summarise` of the sequences that have each attribute, in a first column ``attribute``.
+
+    Args:
+        table: the tidy table.
+        attributes: those of each sequence, by its dataset and name.
+        settings: those of :func:`summarise`.
+
+    Returns:
+        The rows of ``"all sequences"`` first, then the attributes in the order of their names.
+    """
+    import pandas as pd
+
+    named = [(*sequence, name) for sequence, names in attributes.items() for name in set(names)]
+    members = pd.DataFrame(named, columns=["dataset", "sequence", "attribute"])
+    chosen = table.merge(members, on=["dataset", "sequence"])
+    everything = table.assign(attribute=ALL_SEQUENCES)
+    divided = pd.concat([everything, chosen.sort_values("attribute", kind="stable")])
+    return summarise(divided, **settings)
+
+
+def _wide(table: pd.DataFrame, metrics: Sequence[str]) -> tuple[pd.DataFrame, dict[str, list[Any]]]:
+    """A column for each forecaster, all traces last; and each key's values as they appear."""
+    import pandas as pd
+
+    missing = set(_KEYS[1:] + ["dataset", "sequence", "value"]) - set(table)
+    if missing:
+        raise LaeError(f"the table of a comparison lacks the columns {', '.join(sorted(missing))}")
+    table = table[table["metric"].isin(list(metrics))]
+    keys = [key for key in _KEYS if key in table]
+    order = {key: list(table[key].unique()) for key in keys}
+    rows = [*(key for key in keys if key != "forecaster"), "dataset", "sequence"]
+    try:
+        wide = table.set_index([*rows, "forecaster"])["value"].unstack("forecaster")
+    except ValueError as error:
+        raise LaeError("the table of a comparison has two values for the same thing") from error
+    wide = wide.sort_index().reset_index()
+    if len(order["trace"]) > 1:
+        order["trace"].append(ALL_TRACES)
+        whole = wide.dropna(subset=[name for name in order["forecaster"] if name != "offline"])
+        alike = whole.drop(columns="trace").groupby([key for key in rows if key != "trace"])
+        # pandas' mean skips NaN: without offline in one trace there is none in all
+        pooled = alike.mean().where(alike.count().eq(alike.size(), axis=0)).reset_index()
+        wide = pd.concat([wide, pooled.assign(trace=ALL_TRACES)])
+    return wide, order
+
+
+def _weights(count: int, resamples: int, seed: int) -> Floats:
+    """Share of each sequence in each resample, float64 [resamples, count]; rows sum to 1."""
+    generator = np.random.Generator(np.random.PCG64(seed))
+    return generator.multinomial(count, np.full(count, 1 / count), size=resamples) / count
+
+
+def _compared(
+    scores: Floats,
+    names: Sequence[str],
+    weights: Floats,
+    baselines: Sequence[str],
+    confidence: float,
+) -> dict[str, Any]:
+    """The columns of one group from its scores [F, S], each of length F."""
+    columns: dict[str, Any] = {}
+    tails = [(1 - confidence) / 2, (1 + confidence) / 2]
+
+    def add(name: str, value: Floats, samples: Floats, prefix: str) -> None:
+        columns[name] = value
+        columns[f"{prefix}low"], columns[f"{prefix}high"] = np.quantile(samples, tails, axis=1)
+
+    mean = scores.mean(axis=1)
+    # not a product by BLAS, where a row's last bits depend on the number of rows
+    resampled = np.einsum("fs,rs->fr", scores, weights)
+    unknown = np.full(len(names), np.nan)
+    add("mean", mean, resampled, "")
+    for baseline in baselines:
+        name = f"vs_{baseline}"
+        if baseline not in names:
+            columns |= dict.fromkeys([name, f"{name}_low", f"{name}_high", f"{name}_p"], unknown)
+            columns |= {f"{name}_better": 0, f"{name}_worse": 0}
+            continue
+        b = names.index(baseline)
+        differences = np.round(scores - scores[b], _NOISE_DECIMALS)
+        add(name, mean - mean[b], resampled - resampled[b], f"{name}_")
+        columns[f"{name}_p"] = [signed_rank_p(row) for row in differences]
+        columns[f"{name}_better"] = (differences > 0).sum(axis=1)
+        columns[f"{name}_worse"] = (differences < 0).sum(axis=1)
+    if {"hold", "offline"} <= set(names):
+        hold, offline = names.index("hold"), names.index("offline")
+        loss, losses = mean[offline] - mean[hold], resampled[offline] - resampled[hold]
+        share = (mean - mean[hold]) / (loss if loss > 0 else np.nan)
+        shares = (resampled - resampled[hold]) / np.where((losses > 0).all(), losses, np.nan)
+        add("recovered", share, shares, "recovered_")
+    else:
+        columns |= dict.fromkeys(["recovered", "recovered_low", "recovered_high"], unknown)
+    return columns
+
+
+def signed_rank_p(differences: Floats) -> float:
+    """Two-sided p of Wilcoxon's signed-rank test ("Individual Comparisons by Ranking", 1945).
+
+    Zeros leave first, as Wilcoxon has it; if nothing is left, p is 1. It is exact for fewer than 10
+    differences (one alone has p = 1), and for up to 50 if no two are equally large; else normal.
+
+    Args:
+        differences: paired, float64 [S].
+    """
+    from scipy.stats import wilcoxon
+
+    differences = differences[differences != 0]
+    if not len(differences):
+        return 1.0
+    distinct = len(np.unique(np.abs(differences)))
+    exact = len(differences) < 10 or distinct == len(differences) <= 50
+    # named, since what scipy takes for "auto" changes with its version
+    return float(wilcoxon(differences, method="exact" if exact else "approx").pvalue)
+
+
+def comparison_table(summary: pd.DataFrame) -> str:
+    """The summary as text: a line per trace, setting and forecaster, then how it was computed.
+
+    The first metric has intervals and tests, the others have their means. ``summary`` is what
+    :func:`summarise` or :func:`by_attribute` gave, or some rows of it.
+    """
+    first, *others = summary["metric"].unique()
+    baselines = [name[3:-7] for name in summary if name.endswith("_better")]
+    left = ["attribute"] if "attribute" in summary else []
+    left += ["trace", "latency"]
+    left += ["sigma"] if (summary["sigma"] > 0).any() else []
+    left += ["forecaster"]
+    header = [*left, "n", METRIC_LABELS.get(first, first), "recovered"]
+    for baseline in baselines:
+        header += [f"vs {baseline}", "p", "+/-"]
+    header += [METRIC_LABELS.get(metric, metric) for metric in others]
+    keys = [key for key in _KEYS[:-1] if key in summary]
+    means = summary.set_index([*keys, "metric"])["mean"].to_dict()
+    lines = []
+    for row in summary[summary["metric"] == first].to_dict("records"):
+        shown = {
+            **row,
+            "latency": setting_label(row["latency"], row["scale"]),
+            "sigma": f"{row['sigma']:g}",
+        }
+        line = [*(shown[key] for key in left), str(row["sequences"])]
+        line += [_interval(row["mean"], row["low"], row["high"])]
+        if row["forecaster"] in ("hold", "offline"):
+            line += ["-"]
+        else:
+            line += [_share(row["recovered"], row["recovered_low"], row["recovered_high"])]
+        for baseline in baselines:
+            line += _difference(row, baseline)
+        key = [row[name] for name in keys]
+        lines.append(line + [_number(means.get((*key, m), np.nan), "{:.3f}") for m in others])
+    return "\n".join(
+        [text_table(header, lines, len(left)), summary.attrs.get("method", "")]
+    ).strip()
+
+
+def setting_label(latency: str, scale: float) -> str:
+    """A latency and its scale, such as ``"recorded x 2"``."""
+    return latency if scale == 1 else f"{latency} x {scale:g}"
+
+
+def p_label(p: float) -> str:
+    """A p value as text: ``"0.013"``, ``"<0.001"``, or ``"-"`` if it is NaN."""
+    return "<0.001" if p < 0.001 else _number(p, "{:.3f}")
+
+
+def _difference(row: Mapping[str, Any], baseline: str) -> list[str]:
+    """Three cells: mean paired difference, p, sequences better and worse."""
+    name = f"vs_{baseline}"
+    if row["forecaster"] == baseline or np.isnan(row[name]):
+        return ["-"] * 3
+    counts = f"{row[f'{name}_better']}/{row[f'{name}_worse']}"
+    return [f"{row[name]:+.3f}", p_label(row[f"{name}_p"]), counts]
+
+
+def _interval(value: float, low: float, high: float) -> str:
+    return f"{value:.3f} [{low:.3f}, {high:.3f}]"
+
+
+def _share(value: float, low: float, high: float) -> str:
+    text = _number(100 * value, "{:.1f}%")
+    return text if np.isnan(low) else f"{text} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def _number(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else form.format(value)
