@@ -93,6 +93,7 @@ def evaluate(
     sigmas: Sequence[Fraction] = (Fraction(0),),
     convention: Convention = PYSOT,
     at_arrival: bool = False,
+    costs: Mapping[str, int] | None = None,
 ) -> Evaluation:
     """Score the runs of one trace, in groups, so that memory does not grow with the trace.
 
@@ -103,6 +104,7 @@ def evaluate(
         sigmas: distinct permitted latencies in frames, ascending.
         convention: how frames and thresholds count.
         at_arrival: score outputs at their own frames, as VOT does (see :func:`pair`).
+        costs: what an answer costs, ns, by forecaster; 0 if not named. It delays the answers.
 
     Raises:
         LaeError: if there is no run or no forecaster, or whatever iterating over the runs raises.
@@ -110,7 +112,7 @@ def evaluate(
     if not forecasters:
         raise LaeError("name at least one forecaster, such as hold")
     parts = [
-        _evaluate_group(group, metadata, forecasters, sigmas, convention, at_arrival)
+        _evaluate_group(group, metadata, forecasters, sigmas, convention, at_arrival, costs or {})
         for group in batched(runs)
     ]
     if not parts:
@@ -125,12 +127,18 @@ def _evaluate_group(
     sigmas: Sequence[Fraction],
     convention: Convention,
     at_arrival: bool,
+    costs: Mapping[str, int],
 ) -> Evaluation:
     """Score some runs at once."""
-    pairing = pair([run.schedule for run in runs], sigmas, at_arrival)
+    schedules = [run.schedule for run in runs]
+    needed = {0, *(costs.get(name, 0) for name in forecasters)}
+    pairings = {cost: pair(schedules, sigmas, at_arrival, cost) for cost in needed}
+    pairing = pairings[0]
     scorer = _Scorer(runs, convention)
     per_forecaster = [
-        scorer.scores_of(*_answers(runs, metadata, pairing, name, factory), len(sigmas))
+        scorer.scores_of(
+            *_answers(runs, metadata, pairings[costs.get(name, 0)], name, factory), len(sigmas)
+        )
         for name, factory in forecasters.items()
     ]
     calls = [run.schedule.elapsed_ns[1:] for run in runs]
@@ -180,9 +188,10 @@ def answers(
     factory: AnyFactory,
     sigma: Fraction = Fraction(0),
     at_arrival: bool = False,
+    cost_ns: int = 0,
 ) -> Answers:
     """What a forecaster answers for every world frame of one run."""
-    pairing = pair([run.schedule], [sigma], at_arrival)
+    pairing = pair([run.schedule], [sigma], at_arrival, cost_ns)
     fed, found, boxes = _answers([run], metadata, pairing, name, factory)
     return Answers(pairing.frames[fed.output[found.item]], boxes)
 

@@ -127,7 +127,7 @@ def new_network() -> Any:
     """An untrained network, from torch's random state."""
     import torch
 
-    network = torch.nn.Sequential(
+    network: Any = torch.nn.Sequential(
         torch.nn.Linear(_CONTEXT, HIDDEN),
         torch.nn.ReLU(),
         torch.nn.Linear(HIDDEN, HIDDEN),

@@ -20,7 +20,7 @@ from lae_sim.boxes import Floats
 from lae_sim.clock import Clock
 from lae_sim.engine import Ints, Policy, Service, simulate
 from lae_sim.errors import LaeError, explained
-from lae_sim.forecast import Forecaster, ForecasterFactory
+from lae_sim.forecast import AnyFactory, Forecaster, factory_for
 from lae_sim.frames import Image, ImageSequence
 from lae_sim.policies import latest, listed
 from lae_sim.recording import Recording
@@ -123,10 +123,11 @@ class Live:
         self,
         sequence: ImageSequence,
         tracker: TimedTracker,
-        pre_forecaster: ForecasterFactory | None = None,
+        pre_forecaster: AnyFactory | None = None,
         keep_size: bool = False,
         service: Service | None = None,
         include_decode: bool = False,
+        forecaster_ns: int | None = 0,
         progress: Callable[[int], object] = lambda frames: None,
     ) -> None:
         """Check that the tracker can start.
@@ -140,6 +141,7 @@ class Live:
                 predicted size, as in Alg. 1.
             service: times of another device, by frame, instead of the measured ones.
             include_decode: count the decoding of a frame as part of its processing.
+            forecaster_ns: what the pre-forecaster adds to a frame's time, ns; None to measure it.
             progress: told how many more world frames are done, after each processed one.
 
         Raises:
@@ -161,6 +163,8 @@ class Live:
         self._forecaster: Forecaster | None = None
         self._service = service
         self._include_decode = include_decode
+        self._forecaster_ns = forecaster_ns
+        self._forecasting_ns = 0
         self._progress = progress
         self._last = -1
         self._size = (0, 0)
@@ -182,6 +186,7 @@ class Live:
         self._progress(frame - self._last)
         self._last = frame
         elapsed_ns = self._service(frame) if self._service else answer.elapsed_ns + decoding
+        elapsed_ns += self._forecasting_ns
         self._elapsed_ns.append(elapsed_ns)
         return elapsed_ns
 
@@ -189,14 +194,17 @@ class Live:
         box = self._sequence.truth[0].tolist()
         if self._pre_forecaster is not None:
             with explained("the pre-forecaster"):
-                self._forecaster = self._pre_forecaster(box, self._size)
+                factory = factory_for(self._pre_forecaster, self._sequence)
+                self._forecaster = factory(box, self._size)
         return self._tracker.init(image, box)
 
     def _track(self, frame: int, image: Image) -> Answer:
         if self._forecaster is None:
             return self._tracker.track(image)
         with explained("the pre-forecaster"):
+            before = perf_counter_ns()
             x, y, w, h = self._forecaster.predict(frame)
+            spent = perf_counter_ns() - before
             if self._keep_size:
                 _, _, last_w, last_h = self._found
                 x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
@@ -205,7 +213,10 @@ class Live:
         if answer.box is not None:
             self._found = answer.box
             with explained("the pre-forecaster"):
+                before = perf_counter_ns()
                 self._forecaster.update(frame, answer.box)
+                spent += perf_counter_ns() - before
+        self._forecasting_ns = spent if self._forecaster_ns is None else self._forecaster_ns
         return answer
 
     def _check(self, frame: int, image: Image) -> None:

@@ -80,7 +80,10 @@ class Pairing:
 
 
 def pair(
-    schedules: Sequence[Schedule], sigmas: Sequence[Fraction], at_arrival: bool = False
+    schedules: Sequence[Schedule],
+    sigmas: Sequence[Fraction],
+    at_arrival: bool = False,
+    cost_ns: int = 0,
 ) -> Pairing:
     """Pair the outputs of some sequences with their queries.
 
@@ -89,6 +92,7 @@ def pair(
         sigmas: distinct permitted latencies in frames, ascending.
         at_arrival: let each output count from its own frame's arrival, as the VOT toolkit scores;
             latency then plays no part.
+        cost_ns: what an answer costs to make of an output; it delays all but the initial box.
 
     Raises:
         LaeError: if the clocks differ, calls overlap, or the sigmas are not ascending, or too fine
@@ -104,7 +108,8 @@ def pair(
     numerators = [int(sigma * scale) for sigma in sigmas]
     interval = schedules[0].clock.frame_ticks
     lengths = np.array([schedule.length for schedule in schedules], np.int64)
-    last_ready = max(int(schedule.ready[-1]) for schedule in schedules)
+    cost = cost_ns * schedules[0].clock.ticks_per_ns
+    last_ready = max(int(schedule.ready[-1]) for schedule in schedules) + cost
     largest = max(last_ready // interval, int(lengths.max())) * scale
     most_sigma = max(map(abs, numerators))
     if max(scale * interval, largest + most_sigma) >= _NEVER or most_sigma > MOST_FRAMES * scale:
@@ -123,7 +128,7 @@ def pair(
             "schedule with at_arrival=True"
         )
     else:
-        frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]), interval)
+        frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]) + cost, interval)
         steps = frame * scale - (-rest * scale // interval)
     steps[offsets[:-1]] = -_NEVER
     next_steps = np.append(steps[1:], _NEVER)
