@@ -124,18 +124,20 @@ def attribute_bars(
     groups = list(chosen.groupby(["trace", "latency", "scale", "sigma"], sort=False))
     places, factor = np.arange(len(counts)), 100 if value == "recovered" else 1
     height = 1.2 + len(counts) * max(0.35, 0.1 * len(rivals))
-    figure, panels = _grid(len(groups), 4, height, sharey=True)
+    figure, panels = _grid(len(groups), 4, height, sharex=True, sharey=True)
     for axes, ((trace, latency, scale, sigma), group) in zip(panels, groups):
         title = f"{trace}, {setting_label(latency, scale)}"
         axes.set_title(title + (rf", $\sigma$ = {sigma:g}" if sigma else ""))
         for name in styles if value == "mean" else rivals:
             one = group[group["forecaster"] == name].set_index("attribute").reindex(counts.index)
+            known = one[value].notna().to_numpy()
+            one, at = one[known], places[known]
             middle = factor * one[value]
             if name == "offline":
-                axes.plot(middle, places, "|", color="black", markersize=14, label=name)
+                axes.plot(middle, at, "|", color="black", markersize=14, label=name)
                 continue
             axes.barh(
-                places + _offset(rivals, name),
+                at + _offset(rivals, name),
                 middle,
                 0.8 / len(rivals),
                 color=styles[name]["color"],
@@ -146,11 +148,11 @@ def attribute_bars(
         axes.set(
             xlabel=_SHARE_LABEL if factor == 100 else _label(metric), ylim=(places[-1] + 0.5, -0.5)
         )
-        if factor == 100:
-            _within_limits(axes.set_xlim, axes.get_xlim())
         axes.set_yticks(places, [f"{name} (n = {count})" for name, count in counts.items()])
         axes.grid(axis="x", alpha=0.3)
         axes.set_axisbelow(True)
+    if factor == 100:
+        _within_limits(panels[0].set_xlim, panels[0].get_xlim())
     _legend(figure, panels[0], styles)
     return figure
 
@@ -184,8 +186,10 @@ def _offset(names: Sequence[str], name: str) -> float:
 def _dots(
     axes: Axes, places: Any, rows: pd.DataFrame, value: str, factor: float, name: str, style: Any
 ) -> None:
+    known = rows[value].notna().to_numpy()
+    rows = rows[known]
     axes.errorbar(
-        places,
+        places[known],
         factor * rows[value],
         _errors(rows, value, factor),
         color=style["color"],

@@ -54,10 +54,14 @@ def test_overview_shows_means_and_shares_at_the_smallest_sigma():
     assert ticks == ["x", "x x 2", "y", "y x 2"]
 
 
-def test_overview_without_offline_says_so():
+def test_what_is_not_known_without_offline():
     rows = table()
-    figure = overview(summarise(rows[rows["forecaster"] != "offline"], resamples=10))
+    rows = rows[rows["forecaster"] != "offline"]
+    figure = overview(summarise(rows, resamples=10))
     assert figure.axes[1].texts[0].get_text() == "not known: no offline scores"
+    figure.savefig(io.BytesIO())
+    figure = attribute_bars(by_attribute(rows, {}, resamples=10))
+    assert not figure.axes[0].patches
     figure.savefig(io.BytesIO())
 
 
