@@ -22,7 +22,6 @@ from .latency import (
 from .live import LiveRun, run_every_frame, run_real_time
 from .metadata import Metadata
 from .metrics import CONVENTIONS, Convention, precision_curve, success_curve
-from .options import load_forecaster
 from .pairing import SIGMA_GRID, Pairing, pair
 from .policies import every, fifo, latest, shrinking_tail, vot_realtime
 from .recording import Recording
@@ -31,6 +30,7 @@ from .run import Run, replay_sequence, replay_trace
 from .synthetic import synthetic_dataset
 from .trace import Trace, read_trace, validate, write_trace
 from .worker import InProcess, Worker
+from .zoo import load_forecaster
 
 __version__: str
 

@@ -13,12 +13,14 @@ from lae_sim import __version__
 from lae_sim.errors import LaeError
 
 COMMANDS = {
+    "compare": "compare forecasters, with intervals and paired tests",
     "convert": "make a trace from results that a tracker left (boxes and times)",
     "fidelity": "measure how far replays of a tracker are from its closed loop",
     "profile": "run a tracker on this device and leave a trace",
     "render": "draw a replay over its frames, as a film or a contact sheet",
     "replay": "replay traces and score them, latency counted",
     "show": "say what a trace holds: provenance, times, stalls, drift",
+    "train": "train the learned forecaster on traces",
 }
 
 Parsed = TypeVar("Parsed")

@@ -14,7 +14,7 @@ import numpy as np
 from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
-from lae_sim.forecast import ForecasterFactory, Lanes, Sequenced
+from lae_sim.forecast import AnyFactory, ForecasterFactory, Lanes, Sequenced, factory_for
 from lae_sim.pairing import histories, pair, pairs
 from lae_sim.run import Run
 
@@ -125,11 +125,11 @@ class CrossFitted:
     """
 
     folds: dict[str, int]
-    factories: tuple[ForecasterFactory, ...]
+    factories: tuple[AnyFactory, ...]
 
     def for_sequence(self, sequence: Sequenced) -> ForecasterFactory:
         """The factory that was trained without this sequence."""
-        return self.factories[self.folds[sequence.name]]
+        return factory_for(self.factories[self.folds[sequence.name]], sequence)
 
 
 def cross_fitted(
@@ -137,7 +137,7 @@ def cross_fitted(
     examples: Examples,
     folds: dict[str, int],
     seed: int = 0,
-    progress: Callable[[int], object] = lambda folds: None,
+    progress: Callable[[], object] = lambda: None,
 ) -> CrossFitted:
     """Train once per fold, without the fold's sequences.
 
@@ -146,23 +146,30 @@ def cross_fitted(
         examples: of all sequences, those to be scored among them.
         folds: the fold of each sequence (see :func:`assign_folds`).
         seed: of the training.
-        progress: told how many more folds are done.
+        progress: called before each fold.
     """
     factories = []
     for fold in range(max(folds.values()) + 1):
+        progress()
         held_out = {name for name, its in folds.items() if its == fold}
         factories.append(trainer.fit(examples.without(held_out), seed))
-        progress(1)
     return CrossFitted(folds, tuple(factories))
+
+
+def video_of(sequence: str) -> str:
+    """The video that a sequence is part of, by its name.
+
+    A number or an ``s`` at the end tells parts apart: ``car1_1``, ``car1_2`` and ``car1_s`` are one
+    video, and so are ``Jogging-1`` and ``Jogging-2``.
+    """
+    return _PART_OF_VIDEO.sub("", sequence)
 
 
 def assign_folds(sequences: Iterable[str], folds: int = 5, seed: int = 0) -> dict[str, int]:
     """Deal sequences out to folds; the parts of one video stay together.
 
-    Sequences are parts of one video if their names differ only in a number or an ``s`` at the end
-    (``car1_1``, ``car1_2``, ``car1_s``; ``Jogging-1``, ``Jogging-2``). The videos are dealt in the
-    order of a hash of the seed and their names, the largest fold one video larger than the
-    smallest.
+    The videos are dealt in the order of a hash of the seed and their names, the largest fold one
+    video larger than the smallest.
 
     Raises:
         LaeError: if there is but one video, or fewer than two folds are asked for.
@@ -171,7 +178,7 @@ def assign_folds(sequences: Iterable[str], folds: int = 5, seed: int = 0) -> dic
         raise LaeError("training on some sequences to score others needs at least two folds")
     videos: dict[str, list[str]] = {}
     for name in sorted(set(sequences)):
-        videos.setdefault(_PART_OF_VIDEO.sub("", name), []).append(name)
+        videos.setdefault(video_of(name), []).append(name)
     if len(videos) < 2:
         raise LaeError("there is only one video: nothing is left to train on if it is scored")
     order = sorted(videos, key=lambda video: sha256(f"{seed}\0{video}".encode()).digest())

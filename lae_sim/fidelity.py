@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli import exit_status
 from lae_sim.errors import LaeError
-from lae_sim.options import load_forecaster, parse_policy
+from lae_sim.options import parse_policy
+from lae_sim.zoo import load_forecaster
 
 if TYPE_CHECKING:
     from lae_sim.evaluation import Evaluation

@@ -11,7 +11,7 @@ Framework", ICCV 2023, Sec. 4); weights over velocities, and training on the ove
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,6 +43,12 @@ class Learned:
     document: Mapping[str, Any]
 
     size = VELOCITIES + 1
+
+    @property
+    def trained_on(self) -> Sequence[str]:
+        """Names of the sequences that it was trained on."""
+        names: Sequence[str] = self.document["sequences"]
+        return names
 
     def __call__(self, window: Window, ahead: Floats) -> Floats:
         """Boxes, float64 [P, 4], so many frames [P] after the newest output of each window."""
@@ -163,7 +169,7 @@ def write_learned(learned: Learned, path: str | os.PathLike[str]) -> None:
         torch.save({**document, "network": learned.network.state_dict()}, temporary)
 
 
-def read_learned(path: str | os.PathLike[str]) -> Windowed:
+def read_learned(path: str | os.PathLike[str]) -> Windowed[Learned]:
     """Read a trained network; nothing in the file is executed.
 
     Raises:

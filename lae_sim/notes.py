@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from lae_sim.evaluation import Evaluation
+from lae_sim.examples import video_of
+from lae_sim.forecast import AnyFactory
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import Convention
 from lae_sim.run import Run
@@ -44,7 +46,7 @@ def notes_on(
     evaluation: Evaluation,
     metadata: Metadata,
     convention: Convention,
-    forecasters: Sequence[str],
+    forecasters: Mapping[str, AnyFactory],
     at_arrival: bool,
 ) -> list[str]:
     """What to say of the scores of a trace, a sentence each."""
@@ -76,4 +78,13 @@ def notes_on(
             f"kalman-lae-pvt does not clip forecasts where the image size is unknown, as it is of "
             f"{unknown} of {len(sequences)} sequences"
         )
+    for name, factory in forecasters.items():
+        rule = getattr(getattr(factory, "base", factory), "rule", None)  # camera+learned:FILE
+        known = {video_of(sequence) for sequence in getattr(rule, "trained_on", ())}
+        seen = sum(video_of(sequence) in known for sequence in sequences)
+        if seen:
+            notes.append(
+                f"{name} was trained on {seen} of these {len(sequences)} sequences, or on parts "
+                "of the same videos: its scores there promise nothing for others"
+            )
     return notes

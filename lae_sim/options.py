@@ -1,4 +1,4 @@
-"""The options of a replay: policies, latency sources and forecasters by name."""
+"""The options of a replay: policies and latency sources by name."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING
 from lae_sim.cli import argument
 from lae_sim.clock import parse_duration, parse_fps, parse_rational
 from lae_sim.errors import LaeError
-from lae_sim.trackers.names import imported
 
 if TYPE_CHECKING:
     from lae_sim.engine import Policy
-    from lae_sim.forecast import ForecasterFactory
     from lae_sim.latency import LatencySource
 
 
@@ -58,11 +56,11 @@ def parse_policy(text: str) -> tuple[Policy, bool]:
     if text == "fifo":
         return policies.fifo, False
     if name == "every":
-        return policies.every(_whole(text, value, least=1)), False
+        return policies.every(_number(text, value, least=1)), False
     if name == "shrinking-tail" and value:
         return policies.shrinking_tail(parse_duration(value)), False
     if name == "vot-realtime":
-        return policies.vot_realtime(*([_whole(text, value)] if value else [])), True
+        return policies.vot_realtime(*([_number(text, value)] if value else [])), True
     raise LaeError(
         f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
         "vot-realtime[:GRACE]"
@@ -85,9 +83,9 @@ def parse_latency(text: str) -> LatencySource:
     if name == "constant":
         return latency.constant(parse_duration(value))
     if name == "resample":
-        return latency.resampled(_whole(text, value))
+        return latency.resampled(_number(text, value))
     if name == "lognormal":
-        return latency.lognormal(_whole(text, value))
+        return latency.lognormal(_number(text, value))
     raise LaeError(
         f"no latency {text!r}: there are recorded, by-call, constant:47ms, resample:SEED, "
         "lognormal:SEED"
@@ -119,34 +117,19 @@ def parse_stride(text: str) -> Fraction:
     return stride
 
 
-def load_forecaster(name: str) -> ForecasterFactory:
-    """A forecaster by its name, or a user's own as ``package.module:factory``.
-
-    Modules are also looked for in the current folder.
+def whole(text: str, least: int = 0) -> int:
+    """A whole number from ``least``.
 
     Raises:
-        LaeError: if there is none of that name, or it cannot be imported.
+        LaeError: if the text is none.
     """
-    from lae_sim.forecast import ConstantVelocity, Hold
-    from lae_sim.kalman import Kalman, KalmanLaePvt
-
-    built_in: dict[str, ForecasterFactory] = {
-        "hold": Hold,
-        "constant-velocity": ConstantVelocity,
-        "kalman": Kalman,
-        "kalman-lae-pvt": KalmanLaePvt,
-    }
-    if name in built_in:
-        return built_in[name]
-    if ":" not in name:
-        raise LaeError(
-            f"no forecaster {name!r}: there are {', '.join(built_in)}, and package.module:factory"
-        )
-    factory: ForecasterFactory = imported(f"forecaster {name!r}", name)
-    return factory
+    if not (text.isascii() and text.isdigit() and len(text) < 19 and int(text) >= least):
+        raise LaeError(f"{text!r} is not a whole number from {least}")
+    return int(text)
 
 
-def _whole(text: str, value: str, least: int = 0) -> int:
-    if not (value.isascii() and value.isdigit() and len(value) < 19 and int(value) >= least):
-        raise LaeError(f"{text!r} needs a whole number from {least} after the colon")
-    return int(value)
+def _number(text: str, value: str, least: int = 0) -> int:
+    try:
+        return whole(value, least)
+    except LaeError as error:
+        raise LaeError(f"{text!r} needs a whole number from {least} after the colon") from error

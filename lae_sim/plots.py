@@ -13,7 +13,7 @@ from lae_sim.boxes import Floats
 from lae_sim.errors import LaeError
 from lae_sim.evaluation import answers
 from lae_sim.files import written_whole
-from lae_sim.forecast import ForecasterFactory
+from lae_sim.forecast import AnyFactory
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import CENTRE_THRESHOLDS, PYSOT, Convention, precision_curve, success_curve
 from lae_sim.pairing import pair
@@ -30,7 +30,7 @@ Curves = dict[str, tuple[Floats, Floats]]
 def curves(
     runs: Iterable[Run],
     metadata: Metadata,
-    forecasters: Mapping[str, ForecasterFactory],
+    forecasters: Mapping[str, AnyFactory],
     sigma: Fraction = Fraction(0),
     convention: Convention = PYSOT,
     at_arrival: bool = False,

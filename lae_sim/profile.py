@@ -14,7 +14,8 @@ from lae_sim import __version__
 from lae_sim.cli import argument, exit_status
 from lae_sim.clock import NS_PER_SECOND, parse_duration, parse_fps
 from lae_sim.errors import LaeError
-from lae_sim.options import load_forecaster, parse_box, parse_policy, parse_stride
+from lae_sim.options import parse_box, parse_policy, parse_stride, whole
+from lae_sim.zoo import load_forecaster
 
 if TYPE_CHECKING:
     from lae_sim.frames import Dataset, ImageSequence
@@ -71,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
     add("--in-process", action="store_true", help="no worker process, no timeouts: for debugging")
     add(
         "--threads",
-        type=argument(partial(_whole, least=1)),
+        type=argument(partial(whole, least=1)),
         metavar="N",
         help="threads that the tracker may use",
     )
@@ -84,7 +85,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add(
         "--warmup",
-        type=argument(_whole),
+        type=argument(whole),
         default=5,
         metavar="N",
         help="calls not measured (default: 5)",
@@ -136,7 +137,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add(
         "--repeat",
-        type=argument(partial(_whole, least=1)),
+        type=argument(partial(whole, least=1)),
         default=1,
         metavar="N",
         help="repeat the first pass (default: 1)",
@@ -386,12 +387,6 @@ def _key_and_value(text: str) -> tuple[str, str]:
     if not (equals and key.isidentifier()):
         raise LaeError(f"{text!r} is not key=value")
     return key, value
-
-
-def _whole(text: str, least: int = 0) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) < 10 and int(text) >= least):
-        raise LaeError(f"{text!r} is not a whole number from {least}")
-    return int(text)
 
 
 if __name__ == "__main__":

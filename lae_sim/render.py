@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli import exit_status
 from lae_sim.errors import LaeError
-from lae_sim.options import add_world, load_forecaster, parse_latency, parse_policy
+from lae_sim.options import add_world, parse_latency, parse_policy
+from lae_sim.zoo import load_forecaster
 
 if TYPE_CHECKING:
     from lae_sim.evaluation import Answers
-    from lae_sim.forecast import ForecasterFactory
+    from lae_sim.forecast import AnyFactory
     from lae_sim.frames import Image, ImageSequence
     from lae_sim.metadata import Metadata
     from lae_sim.run import Run
@@ -55,7 +56,7 @@ class Scene:
         run: Run,
         images: ImageSequence,
         metadata: Metadata,
-        forecasters: Mapping[str, ForecasterFactory],
+        forecasters: Mapping[str, AnyFactory],
         at_arrival: bool = False,
     ) -> Scene:
         """The scene of a run and what forecasters make of it (see `lae_sim.evaluation.answers`).

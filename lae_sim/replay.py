@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING
 from lae_sim.cli import argument, exit_status
 from lae_sim.clock import parse_rational
 from lae_sim.errors import LaeError
-from lae_sim.files import check_distinct
-from lae_sim.options import add_world, load_forecaster, parse_latency, parse_policy
+from lae_sim.files import check_distinct, labels
+from lae_sim.options import add_world, parse_latency, parse_policy
+from lae_sim.zoo import load_forecaster
 
 if TYPE_CHECKING:
     from lae_sim.clock import Clock
-    from lae_sim.forecast import ForecasterFactory
+    from lae_sim.forecast import AnyFactory
     from lae_sim.metrics import Convention
     from lae_sim.report import Report
     from lae_sim.run import Run
@@ -126,7 +127,7 @@ def _replay(arguments: argparse.Namespace) -> None:
     sigmas = sorted({*arguments.sigma, *(SIGMA_GRID if arguments.sigma_grid else ())})
     jobs = [
         _Job.of(path, label, arguments, sigmas)
-        for path, label in zip(arguments.traces, _labels(arguments.traces))
+        for path, label in zip(arguments.traces, labels(arguments.traces))
     ]
     if arguments.plot:
         from lae_sim.plots import check_format
@@ -167,7 +168,7 @@ class _Job:
     clock: Clock
     runs: Callable[[], Iterator[Run]]
     at_arrival: bool
-    forecasters: Mapping[str, ForecasterFactory]
+    forecasters: Mapping[str, AnyFactory]
     sigmas: Sequence[Fraction]
     convention: Convention
 
@@ -222,7 +223,7 @@ def _report(
         runs, metadata, job.forecasters, job.sigmas, job.convention, job.at_arrival
     )
     members = attribute_members(metadata, evaluation.sequences)
-    notes = notes_on(evaluation, metadata, job.convention, list(job.forecasters), job.at_arrival)
+    notes = notes_on(evaluation, metadata, job.convention, job.forecasters, job.at_arrival)
     figures = trace_report(
         evaluation,
         job.clock,
@@ -322,14 +323,6 @@ def _plot(jobs: Sequence[_Job], sigma: Fraction, path: str) -> None:
     plots.save(plots.success_and_precision(named, title), path)
 
 
-def _labels(paths: Sequence[str]) -> list[str]:
-    """File names, where they tell the traces apart; otherwise the paths."""
-    from pathlib import Path
-
-    names = [Path(path).name for path in paths]
-    return names if len(set(names)) == len(names) else list(paths)
-
-
 def _print_tables(
     reports: Sequence[Report], shown: Sequence[float], arguments: argparse.Namespace
 ) -> None:
@@ -340,7 +333,7 @@ def _print_tables(
             print(f"{report['trace']}\n\n{sequence_table(report, shown)}\n")
         if arguments.attributes:
             print(f"{report['trace']}\n\n{attribute_table(report, shown)}\n")
-    print(summary_table(reports, _labels(arguments.traces), shown), end="\n\n")
+    print(summary_table(reports, labels(arguments.traces), shown), end="\n\n")
     for report in reports:
         print(settings_text(report))
 

@@ -230,10 +230,14 @@ def comparison_table(summary: pd.DataFrame) -> str:
     """
     first, *others = summary["metric"].unique()
     baselines = [name[3:-7] for name in summary if name.endswith("_better")]
-    left = ["attribute"] if "attribute" in summary else []
-    left += ["trace", "latency"]
-    left += ["sigma"] if (summary["sigma"] > 0).any() else []
-    left += ["forecaster"]
+    summary = summary.assign(
+        latency=[setting_label(*both) for both in zip(summary["latency"], summary["scale"])],
+        sigma=[f"{sigma:g}" for sigma in summary["sigma"]],
+    )
+    settings = ["trace", "latency", "sigma"]
+    several = [name for name in settings if summary[name].nunique() > 1]
+    told = ", ".join(f"{name} {summary[name].iloc[0]}" for name in settings if name not in several)
+    left = [*(["attribute"] if "attribute" in summary else []), *several, "forecaster"]
     header = [*left, "n", METRIC_LABELS.get(first, first), "recovered"]
     for baseline in baselines:
         header += [f"vs {baseline}", "p", "+/-"]
@@ -242,12 +246,7 @@ def comparison_table(summary: pd.DataFrame) -> str:
     means = summary.set_index([*keys, "metric"])["mean"].to_dict()
     lines = []
     for row in summary[summary["metric"] == first].to_dict("records"):
-        shown = {
-            **row,
-            "latency": setting_label(row["latency"], row["scale"]),
-            "sigma": f"{row['sigma']:g}",
-        }
-        line = [*(shown[key] for key in left), str(row["sequences"])]
+        line = [*(row[key] for key in left), str(row["sequences"])]
         line += [_interval(row["mean"], row["low"], row["high"])]
         if row["forecaster"] in ("hold", "offline"):
             line += ["-"]
@@ -257,9 +256,8 @@ def comparison_table(summary: pd.DataFrame) -> str:
             line += _difference(row, baseline)
         key = [row[name] for name in keys]
         lines.append(line + [_number(means.get((*key, m), np.nan), "{:.3f}") for m in others])
-    return "\n".join(
-        [text_table(header, lines, len(left)), summary.attrs.get("method", "")]
-    ).strip()
+    table = text_table(header, lines, len(left))
+    return "\n".join([f"{told}\n" * bool(told), table, summary.attrs.get("method", "")]).strip()
 
 
 def setting_label(latency: str, scale: float) -> str:

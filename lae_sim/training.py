@@ -38,7 +38,7 @@ class NetworkTrainer:
     rate: float = 3e-3
     progress: Callable[[int], object] = lambda steps: None
 
-    def fit(self, examples: Examples, seed: int = 0) -> ForecasterFactory:
+    def fit(self, examples: Examples, seed: int = 0) -> Windowed[Learned]:
         """Train on all examples; the same seed, machine and threads give the same network.
 
         Raises:
@@ -73,7 +73,9 @@ class NetworkTrainer:
             optimiser.step()
             schedule.step()
             self.progress(1)
-        document = {"sequences": sorted(set(examples.sequences)), "seed": seed, "steps": self.steps}
+        seen = np.unique(examples.lanes.lane(examples.item[usable]))
+        names = sorted({examples.sequences[lane] for lane in seen})
+        document = {"sequences": names, "seed": seed, "steps": self.steps}
         return Windowed(Learned(network.eval(), document))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -48,15 +48,18 @@ class Rule(Protocol):
         """Boxes, float64 [P, 4], so many frames [P] after the newest output of each window."""
 
 
+AnyRule = TypeVar("AnyRule", bound=Rule)
+
+
 @dataclass(frozen=True)
-class Windowed:
+class Windowed(Generic[AnyRule]):
     """The factory of forecasters that follow a rule.
 
     Attributes:
         rule: the forecast from the last outputs.
     """
 
-    rule: Rule
+    rule: AnyRule
 
     def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> _Recent:
         """The forecaster of one sequence."""
@@ -71,7 +74,7 @@ class Windowed:
 class _Recent:
     """A forecaster that keeps the last outputs and applies the rule to them."""
 
-    def __init__(self, factory: Windowed, box: Sequence[float]) -> None:
+    def __init__(self, factory: Windowed[Any], box: Sequence[float]) -> None:
         self._factory = factory
         self._outputs = deque([(0, box)], maxlen=factory.rule.size)
 

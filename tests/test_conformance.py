@@ -15,10 +15,10 @@ from lae_sim.clock import Clock, parse_fps
 from lae_sim.evaluation import answers, evaluate
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import find_convention
-from lae_sim.options import load_forecaster
 from lae_sim.recording import Recording
 from lae_sim.run import Run, replay_sequence
 from lae_sim.trace import Trace, read_trace, write_trace
+from lae_sim.zoo import load_forecaster
 
 CASES = sorted((SHARED / "conformance").glob("*.json"))
 

@@ -10,9 +10,9 @@ import scipy.io
 from lae_sim.clock import Clock
 from lae_sim.convert import main
 from lae_sim.evaluation import evaluate
-from lae_sim.options import load_forecaster
 from lae_sim.run import replay_sequence
 from lae_sim.trace import read_trace
+from lae_sim.zoo import load_forecaster
 
 TRUTH = np.array([[10 + 3 * i, 20, 30 + i % 3, 40] for i in range(6)], float)
 TIMES = [100_000_000, 20_000_000, 20_000_001, 26_255_000, 20_000_000, 20_000_000]

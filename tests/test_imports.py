@@ -125,7 +125,7 @@ assert len(list(read_trace(sys.argv[1]))[0]) == 9
 EVALUATE = """
 from lae_sim.clock import Clock
 from lae_sim.evaluation import evaluate
-from lae_sim.options import load_forecaster
+from lae_sim.zoo import load_forecaster
 from lae_sim.run import replay_sequence
 trace = read_trace(sys.argv[1])
 runs = [replay_sequence(r, Clock.at(trace.metadata.fps)) for r in trace]

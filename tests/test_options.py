@@ -9,7 +9,8 @@ import lae_sim
 from lae_sim.errors import LaeError
 from lae_sim.forecast import ConstantVelocity, Hold
 from lae_sim.kalman import Kalman, KalmanLaePvt
-from lae_sim.options import load_forecaster, parse_latency, parse_policy
+from lae_sim.options import parse_latency, parse_policy
+from lae_sim.zoo import load_forecaster
 
 BUILT_IN = {
     "hold": Hold,

@@ -13,11 +13,11 @@ from lae_sim.clock import Clock
 from lae_sim.evaluation import Evaluation, evaluate
 from lae_sim.latency import by_frame, constant, scaled
 from lae_sim.metadata import Metadata
-from lae_sim.options import load_forecaster
 from lae_sim.pairing import SIGMA_GRID
 from lae_sim.recording import Recording
 from lae_sim.run import replay_sequence
 from lae_sim.trace import Trace, read_trace, write_trace
+from lae_sim.zoo import load_forecaster
 
 METADATA = Metadata.new("30", "every-frame")
 CLOCK = Clock.at(Fraction(30))

@@ -7,7 +7,7 @@ import inspect
 import math
 import os
 import sys
-from typing import Any, Mapping
+from typing import Any, Mapping, Sequence
 
 from lae_sim.errors import LaeError
 from lae_sim.trackers.protocol import Tracker
@@ -47,12 +47,27 @@ def make_tracker(name: str, options: Mapping[str, Any]) -> Tracker:
         factory, positional = imported(f"tracker {name!r}", name), []
     else:
         raise LaeError(f"no tracker {name!r}: there are {NAMES}")
+    tracker: Tracker = bound(f"tracker {name!r}", factory, positional, options)
+    return tracker
+
+
+def bound(what: str, factory: Any, positional: Sequence[Any], options: Mapping[str, Any]) -> Any:
+    """Call a factory with options of a command line.
+
+    Args:
+        what: what it makes, for messages.
+        factory: any callable.
+        positional: arguments before the options.
+        options: keyword arguments.
+
+    Raises:
+        LaeError: if the factory does not take them; it says which it takes.
+    """
     try:
         inspect.signature(factory).bind(*positional, **options)
     except TypeError as error:
-        raise LaeError(f"tracker {name!r}: {error}; it takes {_signature(factory)}") from error
-    tracker: Tracker = factory(*positional, **options)
-    return tracker
+        raise LaeError(f"{what}: {error}; it takes {_signature(factory)}") from error
+    return factory(*positional, **options)
 
 
 def parse_options(items: Mapping[str, str]) -> dict[str, Any]:

@@ -1,0 +1,131 @@
+"""Forecasters by the names that command lines use."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lae_sim.errors import LaeError
+from lae_sim.trackers.names import bound, imported, parse_options
+
+if TYPE_CHECKING:
+    from lae_sim.examples import Trainer
+    from lae_sim.forecast import AnyFactory
+    from lae_sim.frames import ImageSequence
+
+FORECASTERS = """\
+forecasters:
+  hold                    the latest box: the baseline
+  constant-velocity       the last two boxes
+  kalman                  the paper's filter
+  kalman-lae-pvt          as its code was released: restarts, clipping
+  kalman:q=3,decay=0.99   its family: q, r, p0, decay, state=corner|centre
+  g-h[:g=0.95,h=0.8]      the g-h filter
+  imm[:quiet=1,...]       two Kalman filters, quiet and agile: also agile, r, p0, stay
+  least-squares[:n=8,...] a line through the last boxes: also forgetting, huber
+  learned:FILE.pt         a network that lae-sim train trained (extra torch)
+  oracle                  the truth: the ceiling
+  camera+NAME             any of these over the camera's motion (needs the frames: --root)
+  package.module:factory  your own
+"""
+
+# name -> (module, attribute, whether it takes options)
+_BUILT_IN = {
+    "hold": ("forecast", "Hold", False),
+    "constant-velocity": ("forecast", "ConstantVelocity", False),
+    "kalman": ("kalman", "Kalman", False),
+    "kalman-lae-pvt": ("kalman", "KalmanLaePvt", False),
+    "g-h": ("filters", "GH", True),
+    "imm": ("filters", "IMM", True),
+    "least-squares": ("least_squares", "LeastSquares", True),
+    "oracle": ("forecast", "Oracle", False),
+}
+_TRAINED = {"learned": "NetworkTrainer", "tuned-kalman": "KalmanTrainer"}
+
+
+def load_forecaster(
+    name: str, frames: Mapping[str, ImageSequence] | None = None, fps: Fraction = Fraction(30)
+) -> AnyFactory:
+    """A forecaster by its name, or a user's own as ``package.module:factory``.
+
+    Modules are also looked for in the current folder.
+
+    Args:
+        name: as in ``FORECASTERS``.
+        frames: image sequences by name, for ``camera+NAME``.
+        fps: the world's frame rate, for the same.
+
+    Raises:
+        LaeError: if there is none of that name, it must be trained first, its options do not fit,
+            or it cannot be imported.
+    """
+    from lae_sim.examples import Trainer
+
+    found = load_any(name, frames, fps)
+    if isinstance(found, Trainer):
+        raise LaeError(
+            f"{name} must be trained: lae-sim compare does so on other sequences; lae-sim train "
+            "makes a file for learned:FILE.pt; kalman:q=3,decay=0.99 takes numbers as they are"
+        )
+    return found
+
+
+def load_any(
+    name: str, frames: Mapping[str, ImageSequence] | None = None, fps: Fraction = Fraction(30)
+) -> AnyFactory | Trainer:
+    """The same, or a trainer: ``learned``, ``tuned-kalman``, or a user's own class with ``fit``.
+
+    Raises:
+        LaeError: as :func:`load_forecaster`.
+    """
+    if name.startswith("camera+"):
+        if frames is None:
+            raise LaeError(f"{name} needs the frames: give the dataset's folder with --root")
+        from lae_sim.examples import Trainer
+
+        base = load_any(name.removeprefix("camera+"), frames, fps)
+        kind = "CameraTrainer" if isinstance(base, Trainer) else "CameraCompensated"
+        return _attribute("camera", kind)(base, frames, fps)  # type: ignore[no-any-return]
+    if name in _TRAINED:
+        return _attribute("training", _TRAINED[name])()  # type: ignore[no-any-return]
+    kind, colon, value = name.partition(":")
+    if kind == "learned":
+        from lae_sim.learned import read_learned
+
+        return read_learned(Path(value))
+    if kind in _BUILT_IN:
+        return _built_in(name, kind, value)
+    if not colon:
+        names = ", ".join([*_BUILT_IN, "kalman:q=...", "learned:FILE.pt", "camera+NAME"])
+        raise LaeError(f"no forecaster {name!r}: there are {names}, and package.module:factory")
+    found = imported(f"forecaster {name!r}", name)
+    if isinstance(found, type) and hasattr(found, "fit"):
+        found = bound(f"forecaster {name!r}", found, [], {})
+    return found  # type: ignore[no-any-return]
+
+
+def _built_in(name: str, kind: str, value: str) -> AnyFactory:
+    module, attribute, takes_options = _BUILT_IN[kind]
+    if kind == "kalman" and value:
+        attribute, takes_options = "TunedKalman", True
+    found = _attribute(module, attribute)
+    if not takes_options:
+        if value:
+            raise LaeError(f"forecaster {name!r}: {kind} takes no options")
+        return found  # type: ignore[no-any-return]
+    pairs = [item.partition("=") for item in value.split(",") if item]
+    if not all(key and sign and text for key, sign, text in pairs):
+        raise LaeError(f"forecaster {name!r}: options are KEY=VALUE, separated by commas")
+    options = parse_options({key: text for key, _, text in pairs})
+    what = f"forecaster {name!r}"
+    made = bound(what, found, [], options)
+    if kind == "least-squares":
+        made = _attribute("window", "Windowed")(made)
+    return made  # type: ignore[no-any-return]
+
+
+def _attribute(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(f"lae_sim.{module}"), name)
