@@ -1,4 +1,4 @@
-"""Pictures of a replay (extra ``plot``): success and precision, and the timeline of a sequence."""
+"""Pictures of a replay: success and precision, and the timeline of a sequence."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def check_format(path: str) -> None:
     """Check that a picture can be drawn to a file of this name.
 
     Raises:
-        LaeError: if its ending is not known, or matplotlib is missing.
+        LaeError: if its ending is not known.
     """
     if Path(path).suffix[1:].lower() not in new_figure(1, 1).canvas.get_supported_filetypes():
         raise LaeError(f"cannot draw to {path}: name a .png, .svg or .pdf file")
@@ -186,8 +186,6 @@ def save(figure: Figure, path: str) -> None:
 
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure, of its own: pyplot would keep a list of all."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise LaeError("pictures need matplotlib: pip install 'lae-sim[plot]'") from error
+    from matplotlib.figure import Figure
+
     return Figure(figsize=(width, height), layout="constrained")

@@ -293,21 +293,23 @@ def test_the_text_table():
     table = pd.concat([tidy(scores), tidy(scores, scale=2.0), tidy(scores, metric="dp20")])
     text = comparison_table(summarise(table))
     assert text.splitlines()[:-2] == [
-        "trace  latency       forecaster  n                   AUC       recovered  vs hold      p"
+        "trace a, sigma 0",
+        "",
+        "latency       forecaster  n                   AUC       recovered  vs hold      p"
         "  +/-  DP@20",
-        "-----  ------------  ----------  -  --------------------  --------------  -------  -----"
+        "------------  ----------  -  --------------------  --------------  -------  -----"
         "  ---  -----",
-        "a      recorded      hold        4  0.450 [0.350, 0.550]               -        -      -"
+        "recorded      hold        4  0.450 [0.350, 0.550]               -        -      -"
         "    -  0.450",
-        "a      recorded      mine        4  0.500 [0.425, 0.575]  16.7% [-4, 33]   +0.050  0.375"
+        "recorded      mine        4  0.500 [0.425, 0.575]  16.7% [-4, 33]   +0.050  0.375"
         "  3/1  0.500",
-        "a      recorded      offline     4  0.750 [0.650, 0.850]               -   +0.300  0.125"
+        "recorded      offline     4  0.750 [0.650, 0.850]               -   +0.300  0.125"
         "  4/0  0.750",
-        "a      recorded x 2  hold        4  0.450 [0.350, 0.550]               -        -      -"
+        "recorded x 2  hold        4  0.450 [0.350, 0.550]               -        -      -"
         "    -      -",
-        "a      recorded x 2  mine        4  0.500 [0.425, 0.575]  16.7% [-4, 33]   +0.050  0.375"
+        "recorded x 2  mine        4  0.500 [0.425, 0.575]  16.7% [-4, 33]   +0.050  0.375"
         "  3/1      -",
-        "a      recorded x 2  offline     4  0.750 [0.650, 0.850]               -   +0.300  0.125"
+        "recorded x 2  offline     4  0.750 [0.650, 0.850]               -   +0.300  0.125"
         "  4/0      -",
     ]
     last = " ".join(text.splitlines()[-2:])
@@ -318,8 +320,9 @@ def test_the_text_table():
 def test_the_text_table_names_sigmas_and_attributes_where_there_are_some():
     table = pd.concat([tidy(random_scores(), sigma=sigma) for sigma in (0.0, 0.5)])
     summary = by_attribute(table, {("D", "s00"): ["blur"]}, resamples=10)
-    header, _, first, *_ = comparison_table(summary).splitlines()
-    assert header.split()[:5] == ["attribute", "trace", "latency", "sigma", "forecaster"]
+    told, _, header, _, first, *_ = comparison_table(summary).splitlines()
+    assert told == "trace a, latency recorded"
+    assert header.split()[:3] == ["attribute", "sigma", "forecaster"]
     assert first.split()[:6] == ["all", "sequences", "a", "recorded", "0", "hold"]
 
 
