@@ -38,6 +38,16 @@ def argument(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     return parsed
 
 
+def new_parser(program: str, description: str, examples: str) -> argparse.ArgumentParser:
+    """A command line's parser, whose help ends with examples."""
+    return argparse.ArgumentParser(
+        prog=program,
+        description=description,
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
 def exit_status(work: Callable[[], None], program: str) -> int:
     """Do the work of a command; its exit status is 0, 2 for an error, 130 for Ctrl-C.
 

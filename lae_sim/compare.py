@@ -9,12 +9,12 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.cli import argument, exit_status
+from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.clock import parse_fps, parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, labels
-from lae_sim.options import parse_latency, parse_policy, whole
-from lae_sim.zoo import FORECASTERS, load_any
+from lae_sim.options import add_forecasting, parse_latency, parse_policy, whole
+from lae_sim.zoo import FORECASTERS, find_frames, load_any
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -41,11 +41,8 @@ examples:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Compare forecasters on traces: intervals, paired tests, loss recovered.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    made = new_parser(
+        PROGRAM, "Compare forecasters on traces: intervals, paired tests, loss recovered.", EXAMPLES
     )
     add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")
@@ -57,8 +54,7 @@ def parser() -> argparse.ArgumentParser:
         help="see below (default: kalman least-squares tuned-kalman); hold is always compared",
     )
     add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
-    add("--root", type=Path, metavar="PATH", help="folder of the dataset's frames, for camera+NAME")
-    add("--dataset", metavar="NAME", help="the dataset in --root, if its folder does not say")
+    add_forecasting(made)
     world = made.add_argument_group("the world and the tracker")
     add = world.add_argument
     add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
@@ -77,13 +73,6 @@ def parser() -> argparse.ArgumentParser:
         default=[Fraction(1)],
         metavar="FACTOR",
         help="exact factors on all times, one after another",
-    )
-    add(
-        "--cost",
-        nargs="+",
-        default=[],
-        metavar="[NAME=]TIME",
-        help="what forecasting costs, such as 2ms, or measured; it delays the answers (default: 0)",
     )
     scores = made.add_argument_group("scores")
     add = scores.add_argument
@@ -153,13 +142,8 @@ def _check(arguments: argparse.Namespace) -> None:
 def _forecasters(
     arguments: argparse.Namespace, traces: Mapping[str, Trace]
 ) -> dict[str, AnyFactory | Trainer]:
-    frames = None
     fps = arguments.fps or next(iter(traces.values())).metadata.fps
-    if arguments.root:
-        from lae_sim.datasets import find_dataset
-
-        found = find_dataset(arguments.dataset, arguments.root, arguments.sequence)
-        frames = {sequence.name: sequence for sequence in found.sequences}
+    frames = find_frames(arguments.dataset, arguments.root, arguments.sequence)
     names = dict.fromkeys(["hold", *arguments.forecaster])
     return {name: load_any(name, frames, fps) for name in names}
 

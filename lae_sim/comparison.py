@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lae_sim.costs import resolve_costs
+from lae_sim.costs import cost_notes, resolve_costs
 from lae_sim.engine import Policy
 from lae_sim.errors import LaeError
 from lae_sim.evaluation import Evaluation, evaluate
@@ -122,7 +122,7 @@ def compare(
         for latency, scale, runs in world.replays(trace):
             setting = latency if scale == 1 else f"{latency} x {scale}"
             progress(f"{label}, {setting}")
-            priced = resolve_costs(costs, ready, runs[0].recording)
+            priced = resolve_costs(costs, ready, [runs[0].recording])
             found = evaluate(runs, trace.metadata, ready, sigmas, convention, costs=priced)
             rows = _rows(found, list(ready), sigmas)
             named = {"trace": label, "dataset": dataset, "latency": latency, "scale": float(scale)}
@@ -154,10 +154,7 @@ def _notes(where: str, found: Evaluation, costs: Mapping[str, int]) -> list[str]
             f"{where}: approximate, {share:.3g}% of the outputs follow another frame than when "
             "recorded"
         )
-    if costs:
-        told = ", ".join(f"{name} {ns / 1000:g} us" for name, ns in costs.items())
-        notes.append(f"{where}: answers are late by the cost of forecasting: {told}")
-    return notes
+    return notes + [f"{where}: {note}" for note in cost_notes(costs)]
 
 
 def _rows(found: Evaluation, forecasters: Sequence[str], sigmas: Sequence[Fraction]) -> DataFrame:

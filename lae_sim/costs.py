@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 from time import perf_counter_ns
 
@@ -46,8 +46,14 @@ def measure_cost(factory: AnyFactory, recording: Recording, name: str = "forecas
     return int(median(taken)) if taken else 0
 
 
+def cost_notes(costs: Mapping[str, int]) -> list[str]:
+    """What to say of the costs that were counted, if there were any."""
+    told = ", ".join(f"{name} {ns / 1000:g} us" for name, ns in costs.items())
+    return [f"answers come later by what forecasting costs: {told}"] if costs else []
+
+
 def resolve_costs(
-    told: Sequence[str], forecasters: Mapping[str, AnyFactory], recording: Recording
+    told: Sequence[str], forecasters: Mapping[str, AnyFactory], trace: Iterable[Recording]
 ) -> dict[str, int]:
     """The cost of each forecaster's answers, ns; those not told of cost nothing.
 
@@ -55,7 +61,7 @@ def resolve_costs(
         told: ``COST`` for every forecaster but hold, or ``NAME=COST`` for one; the last one counts.
             A cost is a time such as ``2ms``, or ``measured``.
         forecasters: factories by name.
-        recording: what they are measured on.
+        trace: they are measured on its first recording.
 
     Raises:
         LaeError: if a text is none of these, or names another forecaster.
@@ -67,6 +73,7 @@ def resolve_costs(
             raise LaeError(f"the cost {text!r}: there is no forecaster {name!r} here")
         names = [name] if name else [each for each in forecasters if each != "hold"]
         costs.update(dict.fromkeys(names, parse_cost(cost)))
+    recording = next(iter(trace))
     return {
         name: measure_cost(forecasters[name], recording, name) if cost is None else cost
         for name, cost in costs.items()

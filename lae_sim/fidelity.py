@@ -9,7 +9,7 @@ from fractions import Fraction
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.cli import exit_status
+from lae_sim.cli import exit_status, new_parser
 from lae_sim.errors import LaeError
 from lae_sim.options import parse_policy
 from lae_sim.zoo import load_forecaster
@@ -68,12 +68,7 @@ examples:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    made = new_parser(PROGRAM, DESCRIPTION, EXAMPLES)
     add = made.add_argument
     add("trace", metavar="TRACE", help="a trace of every frame")
     several: Any = {"nargs": "+", "action": "extend", "default": [], "metavar": "TRACE"}

@@ -42,6 +42,21 @@ def add_world(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_forecasting(parser: argparse.ArgumentParser) -> None:
+    """Add what forecasters need: the frames of the camera's motion, and what they cost."""
+    group = parser.add_argument_group("the forecasters")
+    add = group.add_argument
+    add("--root", metavar="PATH", help="folder of the dataset's frames, for camera+NAME")
+    add("--dataset", metavar="NAME", help="the dataset in --root, if its folder does not say")
+    add(
+        "--cost",
+        nargs="+",
+        default=[],
+        metavar="[NAME=]TIME",
+        help="what forecasting costs, such as 2ms, or measured; it delays the answers (default: 0)",
+    )
+
+
 def parse_policy(text: str) -> tuple[Policy, bool]:
     """A policy by name, and whether its outputs count from their own frames' arrival.
 
@@ -115,6 +130,18 @@ def parse_stride(text: str) -> Fraction:
     if not (stride > 1 and stride.numerator <= 1000):
         raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {text!r}")
     return stride
+
+
+def key_and_value(text: str) -> tuple[str, str]:
+    """An option such as ``size=3``.
+
+    Raises:
+        LaeError: if the text is none.
+    """
+    key, equals, value = text.partition("=")
+    if not (equals and key.isidentifier()):
+        raise LaeError(f"{text!r} is not key=value")
+    return key, value
 
 
 def whole(text: str, least: int = 0) -> int:

@@ -34,6 +34,7 @@ def curves(
     sigma: Fraction = Fraction(0),
     convention: Convention = PYSOT,
     at_arrival: bool = False,
+    costs: Mapping[str, int] | None = None,
 ) -> Curves:
     """Curves of the offline boxes, where the trace holds every frame, and of each forecaster."""
     successes: dict[str, list[Floats]] = {}
@@ -43,7 +44,9 @@ def curves(
         truth = run.recording.truth
         boxes = {"offline": run.recording.boxes}
         for name, factory in forecasters.items():
-            boxes[name] = answers(run, metadata, name, factory, sigma, at_arrival).boxes
+            cost_ns = (costs or {}).get(name, 0)
+            found = answers(run, metadata, name, factory, sigma, at_arrival, cost_ns)
+            boxes[name] = found.boxes
         every_frame = every_frame and not np.isnan(run.recording.boxes).any()
         for name, answered in boxes.items():
             success = success_curve(truth, answered, convention)

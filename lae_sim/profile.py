@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
-from lae_sim.cli import argument, exit_status
+from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.clock import NS_PER_SECOND, parse_duration, parse_fps
+from lae_sim.costs import parse_cost
 from lae_sim.errors import LaeError
-from lae_sim.options import parse_box, parse_policy, parse_stride, whole
+from lae_sim.options import key_and_value, parse_box, parse_policy, parse_stride, whole
 from lae_sim.zoo import load_forecaster
 
 if TYPE_CHECKING:
@@ -47,11 +48,10 @@ trackers:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Run a tracker on this device and write a trace: per frame, box and time.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    made = new_parser(
+        PROGRAM,
+        "Run a tracker on this device and write a trace: per frame, box and time.",
+        EXAMPLES,
     )
     group = made.add_argument_group("the tracker")
     add = group.add_argument
@@ -61,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[],
         action="extend",
-        type=argument(_key_and_value),
+        type=argument(key_and_value),
         metavar="KEY=VALUE",
         help="options of the tracker",
     )
@@ -112,6 +112,13 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--policy", metavar="NAME", help="real-time: which frame a free tracker takes (latest)")
     add("--pre-forecaster", metavar="NAME", help="predict the search region, such as kalman")
+    add(
+        "--pre-forecaster-cost",
+        type=argument(parse_cost),
+        default=0,
+        metavar="TIME",
+        help="what it adds to each frame, such as 2ms, or measured (default: 0)",
+    )
     add("--keep-size", action="store_true", help="predict the centre of the search region only")
     add(
         "--timing",
@@ -295,11 +302,16 @@ def _passes(
     )
     common: dict[str, Any] = {"tracker": tracker, "include_decode": arguments.include_decode}
     if arguments.pre_forecaster is not None:
-        common["pre_forecaster"] = load_forecaster(arguments.pre_forecaster)
-        search = "translation" if isinstance(tracker, Translated) else "native"
-        common["keep_size"] = arguments.keep_size
-        document["schedule"] = {"pre_forecaster": arguments.pre_forecaster, "search": search}
-        document["schedule"]["keep_size"] = arguments.keep_size
+        named, cost = arguments.pre_forecaster, arguments.pre_forecaster_cost
+        frames = {sequence.name: sequence for sequence in dataset.sequences}
+        common["pre_forecaster"] = load_forecaster(named, frames, dataset.fps)
+        common["forecaster_ns"], common["keep_size"] = cost, arguments.keep_size
+        document["schedule"] = {
+            "pre_forecaster": named,
+            "pre_forecaster_cost": "measured" if cost is None else f"{cost} ns",
+            "search": "translation" if isinstance(tracker, Translated) else "native",
+            "keep_size": arguments.keep_size,
+        }
 
     def task(name: str, run: Callable[..., LiveRun], rounds: int = 1, **schedule: Any) -> Pass:
         path = out.with_suffix(f".{name}.parquet") if name else out
@@ -380,13 +392,6 @@ def _short(timing: str) -> str:
     """What tells a closed loop's trace from others."""
     constant = timing.startswith("constant:")
     return timing.removeprefix("constant:") if constant else Path(timing).stem
-
-
-def _key_and_value(text: str) -> tuple[str, str]:
-    key, equals, value = text.partition("=")
-    if not (equals and key.isidentifier()):
-        raise LaeError(f"{text!r} is not key=value")
-    return key, value
 
 
 if __name__ == "__main__":

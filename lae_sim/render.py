@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli import exit_status
+from lae_sim.cli import exit_status, new_parser
 from lae_sim.errors import LaeError
 from lae_sim.options import add_world, parse_latency, parse_policy
 from lae_sim.zoo import load_forecaster
@@ -138,11 +138,8 @@ class Scene:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Draw a trace's replay over its frames: a film, or a contact sheet.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    made = new_parser(
+        PROGRAM, "Draw a trace's replay over its frames: a film, or a contact sheet.", EXAMPLES
     )
     add = made.add_argument
     add("trace", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")

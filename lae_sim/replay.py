@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from lae_sim.cli import argument, exit_status
+from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, labels
-from lae_sim.options import add_world, parse_latency, parse_policy
-from lae_sim.zoo import load_forecaster
+from lae_sim.options import add_forecasting, add_world, parse_latency, parse_policy
+from lae_sim.zoo import FORECASTERS, find_frames, load_forecaster
 
 if TYPE_CHECKING:
     from lae_sim.clock import Clock
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 PROGRAM = "lae-sim replay"
 
-EXAMPLES = """\
+EXAMPLES = f"""\
 examples:
   lae-sim replay trace.parquet
   lae-sim replay trace.parquet --latency constant:47ms --forecaster hold kalman --sigma-grid
@@ -35,8 +35,7 @@ examples:
   lae-sim replay a.parquet b.parquet --latency-scale 2 --json | jq '.traces[].results[].auc'
   lae-sim replay trace.parquet --forecaster my_package.my_module:MyForecaster --per-sequence
 
-forecasters:  hold, constant-velocity, kalman (the paper's), kalman-lae-pvt (the released code's),
-              package.module:factory (your own)
+{FORECASTERS}
 policies:     latest, fifo, every:N, shrinking-tail:TIME (expected processing time, such as 47ms),
               vot-realtime[:GRACE] (the VOT toolkit's rule: it skips frames, never scores latency)
 latencies:    recorded, by-call, constant:TIME, resample:SEED, lognormal:SEED
@@ -46,11 +45,10 @@ conventions:  pysot, elae, otb, got10k, got10k-101, exclude
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Replay traces in a discrete-event simulation and score them, latency counted.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    made = new_parser(
+        PROGRAM,
+        "Replay traces in a discrete-event simulation and score them, latency counted.",
+        EXAMPLES,
     )
     add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")
@@ -84,6 +82,7 @@ def parser() -> argparse.ArgumentParser:
     add("--sigma-grid", action="store_true", help="add mAUC and mDP over sigma = 0, 0.02, ..., 1")
     add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
     add("--sequence", nargs="+", metavar="NAME", help="replay these sequences only")
+    add_forecasting(made)
     output = made.add_argument_group("output")
     add = output.add_argument
     add("--per-sequence", action="store_true", help="report each sequence")
@@ -157,6 +156,7 @@ class _Job:
         runs: replays the sequences, from the first, each time it is called.
         at_arrival: whether outputs count from their own frames' arrival.
         forecasters: factories by name; hold, the baseline of all comparisons, is always there.
+        costs: what an answer of each forecaster costs, ns.
         sigmas: permitted latencies, ascending.
         convention: how frames and thresholds count.
     """
@@ -169,6 +169,7 @@ class _Job:
     runs: Callable[[], Iterator[Run]]
     at_arrival: bool
     forecasters: Mapping[str, AnyFactory]
+    costs: Mapping[str, int]
     sigmas: Sequence[Fraction]
     convention: Convention
 
@@ -177,6 +178,7 @@ class _Job:
         cls, path: str, label: str, arguments: argparse.Namespace, sigmas: Sequence[Fraction]
     ) -> _Job:
         from lae_sim.clock import Clock
+        from lae_sim.costs import resolve_costs
         from lae_sim.latency import scaled
         from lae_sim.metrics import find_convention
         from lae_sim.run import replay_trace
@@ -192,6 +194,9 @@ class _Job:
         if arguments.attributes and not trace.metadata.names_attributes:
             raise LaeError(f"{path}: the trace names no attributes of its sequences")
         fps = arguments.fps or trace.metadata.fps
+        frames = find_frames(arguments.dataset, arguments.root, arguments.sequence)
+        names = dict.fromkeys(["hold", *arguments.forecaster])
+        forecasters = {name: load_forecaster(name, frames, fps) for name in names}
         return cls(
             path=path,
             label=label,
@@ -200,7 +205,8 @@ class _Job:
             clock=Clock.at(fps),
             runs=lambda: replay_trace(trace, fps, source, policy, timing, strided),
             at_arrival=at_arrival,
-            forecasters={name: load_forecaster(name) for name in ["hold", *arguments.forecaster]},
+            forecasters=forecasters,
+            costs=resolve_costs(arguments.cost, forecasters, trace) if arguments.cost else {},
             sigmas=sigmas,
             convention=find_convention(arguments.convention),
         )
@@ -210,6 +216,7 @@ def _report(
     job: _Job, sinks: Sequence[Callable[[Run], None]], arguments: argparse.Namespace
 ) -> Report:
     """Replay and score one trace, giving each run to the sinks."""
+    from lae_sim.costs import cost_notes
     from lae_sim.evaluation import evaluate
     from lae_sim.notes import SkippedStalls, notes_on
     from lae_sim.report import attribute_members, trace_report
@@ -220,7 +227,7 @@ def _report(
         sinks = [*sinks, stalls]
     runs = _written(_progress(job.runs(), job.path, job.trace.frames), sinks)
     evaluation = evaluate(
-        runs, metadata, job.forecasters, job.sigmas, job.convention, job.at_arrival
+        runs, metadata, job.forecasters, job.sigmas, job.convention, job.at_arrival, job.costs
     )
     members = attribute_members(metadata, evaluation.sequences)
     notes = notes_on(evaluation, metadata, job.convention, job.forecasters, job.at_arrival)
@@ -246,7 +253,8 @@ def _report(
         "latency": arguments.latency,
         "latency_scale": str(arguments.latency_scale),
         "convention": job.convention.name,
-        "notes": [*notes, *stalls.notes()],
+        "forecaster_cost_ns": dict(job.costs),
+        "notes": [*notes, *stalls.notes(), *cost_notes(job.costs)],
         **figures,
     }
 
@@ -279,7 +287,10 @@ def _sinks(
         for name in arguments.forecaster:
             factory = job.forecasters[name]
             for sigma in arguments.sigma:
-                found = answers(run, job.trace.metadata, name, factory, sigma, job.at_arrival)
+                cost_ns = job.costs.get(name, 0)
+                found = answers(
+                    run, job.trace.metadata, name, factory, sigma, job.at_arrival, cost_ns
+                )
                 for sink in answer_sinks:
                     sink(run, name, sigma, found)
 
@@ -314,7 +325,13 @@ def _plot(jobs: Sequence[_Job], sigma: Fraction, path: str) -> None:
     named: plots.Curves = {}
     for job in jobs:
         found = plots.curves(
-            job.runs(), job.trace.metadata, job.forecasters, sigma, job.convention, job.at_arrival
+            job.runs(),
+            job.trace.metadata,
+            job.forecasters,
+            sigma,
+            job.convention,
+            job.at_arrival,
+            job.costs,
         )
         prefix = f"{Path(job.label).with_suffix('')}: " if len(jobs) > 1 else ""
         named.update({prefix + name: curve for name, curve in found.items()})

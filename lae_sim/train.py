@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from functools import partial
 
-from lae_sim.cli import argument, exit_status
+from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.clock import parse_fps, parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct
@@ -29,11 +29,10 @@ trains across folds, so that no sequence is scored by what has seen it.
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Train a small network to forecast, from what replays of traces ask of it.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    made = new_parser(
+        PROGRAM,
+        "Train a small network to forecast, from what replays of traces ask of it.",
+        EXAMPLES,
     )
     add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="traces, better of every frame")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.errors import LaeError
+from lae_sim.options import key_and_value
 from lae_sim.trackers.names import bound, imported, parse_options
 
 if TYPE_CHECKING:
@@ -107,6 +108,27 @@ def load_any(
     return found  # type: ignore[no-any-return]
 
 
+def find_frames(
+    dataset: str | None, root: str | None, sequences: Sequence[str] | None
+) -> dict[str, ImageSequence] | None:
+    """Image sequences by name, for ``camera+NAME``; None without a folder.
+
+    Args:
+        dataset: what it is called, if its folder does not say.
+        root: the dataset's folder, or ``synthetic``.
+        sequences: those wanted; all by default.
+
+    Raises:
+        LaeError: as :func:`lae_sim.datasets.find_dataset`.
+    """
+    if root is None:
+        return None
+    from lae_sim.datasets import find_dataset
+
+    found = find_dataset(dataset, None if root == "synthetic" else root, sequences)
+    return {sequence.name: sequence for sequence in found.sequences}
+
+
 def _built_in(name: str, kind: str, value: str) -> AnyFactory:
     module, attribute, takes_options = _BUILT_IN[kind]
     if kind == "kalman" and value:
@@ -116,10 +138,7 @@ def _built_in(name: str, kind: str, value: str) -> AnyFactory:
         if value:
             raise LaeError(f"forecaster {name!r}: {kind} takes no options")
         return found  # type: ignore[no-any-return]
-    pairs = [item.partition("=") for item in value.split(",") if item]
-    if not all(key and sign and text for key, sign, text in pairs):
-        raise LaeError(f"forecaster {name!r}: options are KEY=VALUE, separated by commas")
-    options = parse_options({key: text for key, _, text in pairs})
+    options = parse_options(dict(map(key_and_value, value.split(",") if value else ())))
     what = f"forecaster {name!r}"
     made = bound(what, found, [], options)
     if kind == "least-squares":
