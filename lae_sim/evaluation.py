@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, explained
 from lae_sim.forecast import AnyFactory, Lanes, SequenceFactory, forecast, own
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import (
@@ -221,7 +221,8 @@ def _answers(
         first, last = np.searchsorted(fed.sequence, [s, s + 1])
         low, high = np.searchsorted(found.item, fed.offsets[[first, last]])
         item, frame = found.item[low:high] - fed.offsets[first], found.frame[low:high]
-        own_factory = factory.for_sequence(run.recording)
+        with explained(name):
+            own_factory = factory.for_sequence(run.recording)
         parts.append(forecast(own_factory, lanes.part(first, last), item, frame, name))
     return fed, found, np.concatenate(parts)
 

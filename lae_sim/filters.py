@@ -81,7 +81,8 @@ class IMM:
     stay: float = 0.95
 
     def __post_init__(self) -> None:
-        if not (min(self.quiet, self.agile, self.p0) >= 0 and self.r > 0 and 0 < self.stay < 1):
+        fits = [0 <= value < np.inf for value in (self.quiet, self.agile, self.p0)]
+        if not (all(fits) and 0 < self.r < np.inf and 0 < self.stay < 1):
             raise LaeError("an IMM needs quiet, agile, p0 >= 0, r > 0 and 0 < stay < 1")
 
     def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Forecaster:

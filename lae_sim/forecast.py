@@ -233,10 +233,13 @@ def forecast(
     """
     with explained(name):
         if own(factory, "forecast_lanes") and isinstance(factory, LaneFactory):
-            boxes = factory.forecast_lanes(lanes, item, frame)
-            if not np.isfinite(boxes).all():
-                wrong = int(np.argmin(np.isfinite(boxes).all(axis=1)))
-                raise LaeError(f"predicted {boxes[wrong]} for frame {frame[wrong]}, not a box")
+            boxes = np.asarray(factory.forecast_lanes(lanes, item, frame), np.float64)
+            if boxes.shape != (len(item), 4):
+                raise LaeError(f"{name}: answered {boxes.shape}, not {(len(item), 4)}")
+            good = np.isfinite(boxes).all(axis=1)
+            if not good.all():
+                told, at = boxes[~good][0], frame[~good][0]
+                raise LaeError(f"{name}: predicted {told} for frame {at}, not a box x, y, w, h")
             return boxes
         return _streamed(factory, lanes, item, frame, name)
 

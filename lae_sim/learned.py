@@ -11,6 +11,7 @@ Framework", ICCV 2023, Sec. 4); weights over velocities, and training on the ove
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -189,7 +190,7 @@ def read_learned(path: str | os.PathLike[str]) -> Windowed[Learned]:
     except FileNotFoundError as error:
         raise LaeError(f"{path}: no such file") from error
     except Exception as error:  # torch, pickle and zipfile raise all kinds on damaged files
-        reason = str(error).partition("\n")[0][:200]
+        reason = re.split(r"\n|\. ", str(error))[0][:200]  # torch goes on with bad advice
         raise LaeError(f"{path}: not a forecaster that lae-sim train wrote: {reason}") from error
     return Windowed(Learned(network.eval(), document))
 

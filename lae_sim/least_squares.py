@@ -32,8 +32,11 @@ class LeastSquares:
     huber: float = 0.1
 
     def __post_init__(self) -> None:
-        if not (1 <= self.n <= 1000 and 0 < self.forgetting <= 1 and self.huber > 0):
-            raise LaeError("least squares need n >= 1, 0 < forgetting <= 1 and huber > 0")
+        counted = isinstance(self.n, int) and 1 <= self.n <= 1000
+        if not (counted and 0 < self.forgetting <= 1 and 0 < self.huber < np.inf):
+            raise LaeError(
+                "least squares need a whole n of 1 to 1000, 0 < forgetting <= 1 and huber > 0"
+            )
 
     @property
     def size(self) -> int:

@@ -60,7 +60,10 @@ class NetworkTrainer:
             network = new_network()
         optimiser = torch.optim.AdamW(network.parameters(), lr=self.rate, weight_decay=1e-3)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, self.rate, total_steps=self.steps, pct_start=0.1
+            optimiser,
+            self.rate,
+            total_steps=self.steps,
+            pct_start=0.1 + 1e-9,  # torch divides by zero where this is exactly one step
         )
         for _ in range(self.steps):
             which = torch.randint(len(weight), (self.batch,), generator=generator)

@@ -140,7 +140,10 @@ def _built_in(name: str, kind: str, value: str) -> AnyFactory:
         return found  # type: ignore[no-any-return]
     options = parse_options(dict(map(key_and_value, value.split(",") if value else ())))
     what = f"forecaster {name!r}"
-    made = bound(what, found, [], options)
+    try:
+        made = bound(what, found, [], options)
+    except TypeError as error:  # a text is no number
+        raise LaeError(f"{what}: one of its options must be a number") from error
     if kind == "least-squares":
         made = _attribute("window", "Windowed")(made)
     return made  # type: ignore[no-any-return]
