@@ -247,7 +247,7 @@ def filter_lanes(
     position = states[firsts]
     velocity = np.zeros_like(position)
     start = (settings.p0, 0.0, settings.p0)
-    a, b, c = (np.full(len(order), value) for value in start)
+    a, b, c = (np.full(len(order), value, np.float64) for value in start)
     positions, velocities = states.copy(), np.zeros_like(states)
     running = np.searchsorted(-lengths, -np.arange(lengths[0]))  # lanes with more than k outputs
     for k in range(1, int(lengths[0])):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from lae_sim.clock import Clock
 from lae_sim.metadata import Metadata
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -52,3 +55,25 @@ def conformance() -> Path:
 def every_frame() -> Metadata:
     """The smallest metadata of a trace of every frame at 30 frames/s."""
     return Metadata.new("30", "every-frame")
+
+
+@pytest.fixture(scope="session")
+def torch() -> Any:
+    """The torch module on one thread, since several wait for each other on a busy machine."""
+    found = pytest.importorskip("torch", reason="the learned forecaster needs torch")
+    found.set_num_threads(1)
+    return found
+
+
+@pytest.fixture(scope="session")
+def learned(torch: Any) -> Any:
+    """A network that a few steps have trained, on two sequences."""
+    from witness import moving
+
+    from lae_sim.examples import Examples
+    from lae_sim.run import replay_sequence
+    from lae_sim.training import NetworkTrainer
+
+    recordings = [moving(60, seed, f"s{seed}") for seed in range(2)]
+    runs = [replay_sequence(recording, Clock.at(Fraction(30))) for recording in recordings]
+    return NetworkTrainer(steps=12, batch=64).fit(Examples.of(runs), seed=3)

@@ -1,4 +1,4 @@
-"""Forecasters: streaming and lane versions, custom ones, loading by name."""
+"""Forecasters: streaming and lane versions, custom ones, the oracle."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
+from walks import lanes_and_queries, one_lane, streaming
 
 from lae_sim.errors import LaeError
-from lae_sim.forecast import ConstantVelocity, Hold, Lanes, forecast
+from lae_sim.forecast import ConstantVelocity, Hold, Lanes, Oracle, factory_for, forecast
 from lae_sim.kalman import Kalman, KalmanLaePvt
+from lae_sim.recording import Recording
 
 BUILT_IN = {
     "hold": Hold,
@@ -22,48 +23,15 @@ BUILT_IN = {
 }
 
 
-@st.composite
-def lanes_and_queries(draw: st.DrawFn) -> tuple[Lanes, np.ndarray, np.ndarray]:
-    """Some lanes of random walks, with queries as of their items."""
-    lengths = draw(st.lists(st.integers(1, 12), min_size=1, max_size=6))
-    random = np.random.default_rng(draw(st.integers(0, 2**32)))
-    frames, boxes = [], []
-    for length in lengths:
-        frames.append(np.concatenate([[0], np.cumsum(random.integers(1, 6, length - 1))]))
-        walk = random.normal(0, 12, (length, 4)).cumsum(axis=0)
-        walk += [300, 200, 40, 30]
-        walk[:, 2:] = np.abs(walk[:, 2:])
-        far = random.random(length) < 0.15
-        walk[far, :2] += random.normal(0, 200, (far.sum(), 2))
-        boxes.append(walk)
-    sizes = np.where(
-        random.random((len(lengths), 1)) < 0.3, np.inf, random.integers(200, 700, (len(lengths), 2))
-    )
-    offsets = np.cumsum([0, *lengths])
-    lanes = Lanes(offsets, np.concatenate(frames).astype(np.int64), np.concatenate(boxes), sizes)
-    item = np.sort(random.integers(0, offsets[-1], 3 * offsets[-1]))
-    ahead = random.integers(0, 9, len(item))
-    return lanes, item, lanes.frames[item] + ahead
-
-
 @pytest.mark.parametrize("factory", BUILT_IN.values(), ids=BUILT_IN)
 @given(case=lanes_and_queries())
 @settings(max_examples=40)
 def test_streaming_and_lanes_are_equal_bit_for_bit(factory: Any, case: Any) -> None:
     lanes, item, frame = case
     by_lanes = forecast(factory, lanes, item, frame)
-    streaming = forecast(lambda box, size: factory(box, size), lanes, item, frame)
-    assert by_lanes.dtype == streaming.dtype == np.float64
-    assert by_lanes.tobytes() == streaming.tobytes()
-
-
-def one_lane(boxes: Sequence[Sequence[float]], frames: Sequence[int]) -> Lanes:
-    return Lanes(
-        np.array([0, len(boxes)]),
-        np.array(frames),
-        np.array(boxes, float),
-        np.array([[640.0, 360.0]]),
-    )
+    one_by_one = streaming(factory, lanes, item, frame)
+    assert by_lanes.dtype == one_by_one.dtype == np.float64
+    assert by_lanes.tobytes() == one_by_one.tobytes()
 
 
 TWO = one_lane([[0, 0, 10, 10], [4, 2, 12, 10]], [0, 2])
@@ -171,3 +139,59 @@ def test_a_subclass_that_predicts_otherwise_is_asked(base: type) -> None:
     lanes = Lanes(np.array([0, 1]), np.array([0]), np.ones((1, 4)), np.full((1, 2), np.inf))
     answered = forecast(Elsewhere, lanes, np.array([0]), np.array([3]))
     np.testing.assert_array_equal(answered, [[9.0] * 4])
+
+
+class Many:
+    """A user's factory that answers for many lanes at once, whatever it is told to."""
+
+    def __init__(self, answer: Any) -> None:
+        self.answer = answer
+
+    def __call__(self, box: Sequence[float], image_size: Any = None) -> Hold:
+        raise AssertionError("the lanes are there")
+
+    def forecast_lanes(self, lanes: Lanes, item: np.ndarray, frame: np.ndarray) -> Any:
+        return self.answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "problem"),
+    [
+        ([[1, 2, 3, 4], [1, 2, 3, 4], [1, 2, np.nan, 4]], "predicted .* for frame 5, not a box"),
+        ([[1, 2, 3, 4], [1, -np.inf, 3, 4], [1, 2, 3, 4]], "predicted .* for frame 2, not a box"),
+        ([1, 2, 3, 4], r"answered \(4,\), not \(3, 4\)"),
+        ([[1, 2, 3, 4]], r"answered \(1, 4\)"),
+        (None, r"answered \(\)"),
+        (["a"], "ValueError"),
+    ],
+)
+def test_lanes_that_answer_no_boxes_are_refused_by_name(answer: Any, problem: str) -> None:
+    with pytest.raises(LaeError, match=f"^mine: {problem}"):
+        forecast(Many(answer), TWO, ITEM, FRAME, "mine")
+
+
+def test_lanes_may_answer_any_numbers() -> None:
+    found = forecast(Many([[1, 2, 3, 4]] * 3), TWO, ITEM, FRAME)
+    assert found.dtype == np.float64
+    assert found.tolist() == [[1, 2, 3, 4]] * 3
+
+
+TRUTH = [[5, 5, 9, 9], [6, 5, 9, 9], [np.nan] * 4, [8, 5, 0, 9], [9, 5, 9, 9]]
+KNOWN = Recording.new("known", TRUTH, [[1, 1, 4, 4]] * 5, [1] * 5)
+
+
+def test_the_oracle_tells_the_truth_or_holds() -> None:
+    lanes = one_lane([[0, 0, 10, 10], [4, 2, 12, 10]], [0, 2])
+    item, frame = np.array([0, 0, 1, 1, 1, 1]), np.array([0, 1, 2, 3, 4, 99])
+    expected = [TRUTH[0], TRUTH[1], [4, 2, 12, 10], [4, 2, 12, 10], TRUTH[4], TRUTH[4]]
+    factory = factory_for(Oracle, KNOWN)
+    assert forecast(factory, lanes, item, frame).tolist() == expected
+    assert streaming(factory, lanes, item, frame).tolist() == expected
+
+
+def test_a_factory_is_made_for_its_sequence_where_it_asks_for_it() -> None:
+    other = Recording.new("other", [[7, 7, 7, 7]], [[1, 1, 4, 4]], [1])
+    for factory in (Oracle, Oracle()):
+        told = [factory_for(factory, r)([0, 0, 1, 1], None).predict(0) for r in (KNOWN, other)]
+        assert told == [TRUTH[0], [7, 7, 7, 7]]
+    assert factory_for(Hold, KNOWN) is Hold

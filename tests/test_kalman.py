@@ -1,18 +1,31 @@
-"""The paper's filter against filterpy and plain matrices, and the released code's additions."""
+"""The paper's filter against filterpy and matrices, the released code's additions, its family."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from walks import lanes_and_queries, one_lane, streaming
 from witness import DenseKalman, DenseLaePvt, FilterpyKalman
 
-from lae_sim.forecast import Lanes
-from lae_sim.kalman import PAPER, RESTART_IOU, Kalman, KalmanLaePvt, clip, filter_lanes
+from lae_sim.errors import LaeError
+from lae_sim.forecast import Lanes, forecast
+from lae_sim.kalman import (
+    PAPER,
+    RESTART_IOU,
+    Kalman,
+    KalmanLaePvt,
+    TunedKalman,
+    clip,
+    filter_lanes,
+)
 
 BOXES = st.tuples(*[st.floats(-1000, 3000)] * 2, *[st.floats(0.5, 900)] * 2)
 
@@ -195,3 +208,129 @@ def test_lanes_of_any_order_of_lengths_do_not_mix() -> None:
         alone = filter_lanes(part)
         for one, all_ in zip(alone, together):
             assert one.tobytes() == all_[low:high].tobytes()
+
+
+# -------------------------------------------------------------------------- its family, TunedKalman
+
+
+class DenseFamily:
+    """The family with its matrices written out, over any four numbers."""
+
+    def __init__(self, position: Sequence[float], q: float, r: float, p0: float, decay: float):
+        self.q, self.r, self.decay = q, r, decay
+        self.frame = 0
+        self.state = np.array([*position, 0, 0, 0, 0], float)
+        self.covariance = p0 * np.eye(8)
+
+    def transition(self, interval: int) -> np.ndarray:
+        """Frame by frame the position gains the velocity, and the velocity decays."""
+        reach = sum(self.decay**k for k in range(interval))
+        keep = self.decay**interval
+        return np.kron([[1, reach], [0, keep]], np.eye(4))
+
+    def update(self, frame: int, position: Sequence[float]) -> None:
+        interval = frame - self.frame
+        f, h = self.transition(interval), np.eye(4, 8)
+        self.state = f @ self.state
+        self.covariance = f @ self.covariance @ f.T + self.q * interval**2 * np.eye(8)
+        s = h @ self.covariance @ h.T + self.r * np.eye(4)
+        k = self.covariance @ h.T @ np.linalg.inv(s)
+        self.state = self.state + k @ (np.asarray(position, float) - h @ self.state)
+        self.covariance = (np.eye(8) - k @ h) @ self.covariance
+        self.frame = frame
+
+    def predict(self, frame: int) -> np.ndarray:
+        return (self.transition(frame - self.frame) @ self.state)[:4]
+
+
+def centre_state(box: Sequence[float]) -> list[float]:
+    x, y, w, h = box
+    return [x + w / 2, y + h / 2, math.log(math.sqrt(w * h)), math.log(w / h)]
+
+
+def box_of_centre_state(state: Sequence[float]) -> list[float]:
+    cx, cy, scale, aspect = state
+    w, h = (math.exp(min(max(scale + a / 2, -20), 20)) for a in (aspect, -aspect))
+    return [cx - w / 2, cy - h / 2, w, h]
+
+
+NUMBERS = st.fixed_dictionaries(
+    {
+        "q": st.sampled_from([0.0, 1e-3, 0.3, 1.0, 3, 100.0]),
+        "r": st.floats(0.1, 100),
+        "p0": st.sampled_from([0.0, 1.0, 100, 1e4]),  # 100: a whole number is one too,
+        "decay": st.sampled_from([0.3, 0.9, 0.99, 0.999999, 1.0, 1]),
+    }
+)
+
+
+@pytest.mark.parametrize("state", ["corner", "centre"])
+@given(numbers=NUMBERS, data=st.data())
+def test_the_family_agrees_with_dense_matrices(
+    state: str, numbers: dict[str, float], data: st.DataObject
+) -> None:
+    boxes = st.tuples(*[st.floats(-1000, 3000)] * 2, *[st.floats(1, 900)] * 2)
+    into, back = (list, list) if state == "corner" else (centre_state, box_of_centre_state)
+    box = data.draw(boxes)
+    ours = TunedKalman(**numbers, state=state)(box)
+    dense = DenseFamily(into(box), **numbers)
+    frame = 0
+    for interval, measured in data.draw(st.lists(st.tuples(st.integers(1, 9), boxes), max_size=9)):
+        frame += interval
+        ours.update(frame, measured)
+        dense.update(frame, into(measured))
+        for ahead in (0, 1, 7):
+            expected = back(dense.predict(frame + ahead).tolist())
+            np.testing.assert_allclose(ours.predict(frame + ahead), expected, rtol=1e-8, atol=1e-6)
+
+
+@given(case=lanes_and_queries())
+def test_the_default_is_the_papers_filter_to_the_bit(case: Any) -> None:
+    for answers in (forecast, streaming):
+        assert answers(TunedKalman(), *case).tobytes() == answers(Kalman, *case).tobytes()
+
+
+@pytest.mark.parametrize("state", ["corner", "centre"])
+@given(numbers=NUMBERS, case=lanes_and_queries())
+def test_the_family_streams_as_it_answers_for_lanes(
+    state: str, numbers: dict[str, float], case: Any
+) -> None:
+    factory = TunedKalman(**numbers, state=state)
+    found, expected = forecast(factory, *case), streaming(factory, *case)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_velocity_decays() -> None:
+    # with p0 = 0 and q = 0 nothing is learnt; with r tiny the first step is taken as it is
+    model = TunedKalman(r=1e-9, q=0, decay=0.5)([0, 0, 10, 10])
+    model.update(1, [8, 0, 10, 10])  # gains: 1 and decay * b / a = 0.25
+    assert [model.predict(1 + k)[0] for k in range(4)] == pytest.approx([8, 10, 11, 11.5])
+    still = TunedKalman(q=0, p0=0)([0, 0, 10, 10])
+    still.update(1, [8, 0, 10, 10])
+    assert still.predict(5) == [0, 0, 10, 10]
+
+
+@pytest.mark.parametrize("state", ["corner", "centre"])
+@pytest.mark.parametrize("decay", [1e-9, 0.9, 1.0])
+def test_a_forecast_for_long_after_is_finite(state: str, decay: float) -> None:
+    factory = TunedKalman(decay=decay, state=state)
+    lanes = one_lane([[0, 0, 10, 10], [500, 300, 90, 0]], [0, 1])
+    case = lanes, np.array([1, 1]), np.array([10_000, 2**40])
+    for answers in (forecast, streaming):
+        assert np.isfinite(answers(factory, *case)).all()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({name: value} for name in ("q", "r", "p0") for value in (-1, math.nan, math.inf)),
+        *({"decay": value} for value in (0, -0.1, 1.01, math.nan)),
+        {"r": 0},
+        {"state": "corners"},
+        {"state": None},
+    ],
+    ids=str,
+)
+def test_a_filter_that_cannot_be_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(LaeError, match=r"^a Kalman filter"):
+        TunedKalman(**wrong)
