@@ -13,7 +13,6 @@ A similarity of the plane, z -> m z + c with complex z = x + iy, is the pair (m,
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -24,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim.boxes import Floats
+from lae_sim.closest import Closest
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
 from lae_sim.examples import Examples, Trainer
@@ -36,6 +36,7 @@ from lae_sim.forecast import (
     Sequenced,
     factory_for,
     forecast,
+    own_notes,
 )
 from lae_sim.frames import ImageSequence
 
@@ -45,7 +46,6 @@ LEAST_INLIERS = 12
 LEAST_SHARE = 0.3
 SCALES = 0.8, 1.25
 STEPS = 3  # the camera's velocity is the mean of the last so many
-RECENT = 10  # outputs on which the forecasts with and without the camera's motion are compared
 
 Complexes = npt.NDArray[np.complex128]
 
@@ -199,7 +199,19 @@ class CameraCompensated:
         lag = motion.lag(self.fps) if self.lag is None else self.lag
         base = factory_for(self.base, sequence)
         moving = _Moving(base, _outlooks(motion.transforms, lag))
-        return moving if self.always else _Closer((base, moving))
+        return moving if self.always else Closest((base, moving))
+
+    def notes(self, sequences: Sequence[str]) -> list[str]:
+        """By how many frames the camera's motion was late on these sequences."""
+        lags = {
+            self.known[name].lag(self.fps) if self.lag is None else self.lag
+            for name in sequences
+            if name in self.known
+        }
+        late = " to ".join(str(lag) for lag in sorted({min(lags), max(lags)})) if lags else ""
+        why = "by what estimating it takes on this machine" if self.lag is None else "as told"
+        told = [f"the camera's motion is known {late} frames late, {why}"] if lags else []
+        return told + own_notes(self.base, sequences)
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,49 +307,3 @@ class _OnMoving:
     def _stilled(self, frame: int, box: Sequence[float]) -> list[float]:
         still = self._factory.stilled(np.array([box], np.float64), np.array([frame]))
         return still[0].tolist()  # type: ignore[no-any-return]
-
-
-@dataclass(frozen=True, eq=False)
-class _Closer:
-    """Several forecasters; the one whose forecasts of the last outputs were closest answers."""
-
-    several: tuple[ForecasterFactory, ...]
-
-    def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Forecaster:
-        return _Several([factory(box, image_size) for factory in self.several])
-
-    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
-        """The same for many lanes at once."""
-        fed = np.setdiff1d(np.arange(len(lanes.frames)), lanes.offsets[:-1])
-        first, errors, boxes = lanes.first(item), [], []
-        for factory in self.several:
-            missed = np.zeros(len(lanes.frames))
-            foretold = forecast(factory, lanes, fed - 1, lanes.frames[fed])
-            missed[fed] = _distance(foretold, lanes.boxes[fed])
-            recent = item[:, None] - np.arange(RECENT)
-            errors.append(missed[np.maximum(recent, first[:, None])].sum(axis=1))
-            boxes.append(forecast(factory, lanes, item, frame))
-        answers: Floats = np.stack(boxes)[np.argmin(errors, axis=0), np.arange(len(item))]
-        return answers
-
-
-class _Several:
-    def __init__(self, several: Sequence[Forecaster]) -> None:
-        self._several = several
-        self._errors: deque[Floats] = deque(maxlen=RECENT)
-
-    def update(self, frame: int, box: Sequence[float]) -> None:
-        foretold = np.array([each.predict(frame) for each in self._several], np.float64)
-        self._errors.append(_distance(foretold, np.array([box], np.float64)))
-        for each in self._several:
-            each.update(frame, box)
-
-    def predict(self, frame: int) -> Sequence[float]:
-        best = int(np.argmin(sum(self._errors))) if self._errors else 0
-        return self._several[best].predict(frame)
-
-
-def _distance(a: Floats, b: Floats) -> Floats:
-    """Distance of centres, float64 [n]."""
-    apart = a[:, :2] + a[:, 2:] / 2 - b[:, :2] - b[:, 2:] / 2
-    return np.hypot(apart[:, 0], apart[:, 1])

@@ -14,7 +14,7 @@ import numpy as np
 from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
-from lae_sim.forecast import AnyFactory, ForecasterFactory, Lanes, Sequenced, factory_for
+from lae_sim.forecast import AnyFactory, ForecasterFactory, Lanes, Sequenced, factory_for, own_notes
 from lae_sim.pairing import histories, pair, pairs
 from lae_sim.run import Run
 
@@ -130,6 +130,14 @@ class CrossFitted:
     def for_sequence(self, sequence: Sequenced) -> ForecasterFactory:
         """The factory that was trained without this sequence."""
         return factory_for(self.factories[self.folds[sequence.name]], sequence)
+
+    def notes(self, sequences: Sequence[str]) -> list[str]:
+        """What each fold's factory has to say of the sequences that it scores."""
+        notes: dict[str, None] = {}
+        for fold, factory in enumerate(self.factories):
+            scored = [name for name in sequences if self.folds[name] == fold]
+            notes.update(dict.fromkeys(own_notes(factory, scored)))
+        return list(notes)
 
 
 def cross_fitted(

@@ -110,12 +110,25 @@ class SequenceFactory(Protocol):
         """The factory for one sequence."""
 
 
+@runtime_checkable
+class NotedFactory(Protocol):
+    """A factory that has something to say of what its scores are worth."""
+
+    def notes(self, sequences: Sequence[str]) -> list[str]:
+        """What to say of its forecasts of these sequences, a sentence each."""
+
+
 AnyFactory = ForecasterFactory | SequenceFactory
 
 
 def factory_for(factory: AnyFactory, sequence: Sequenced) -> ForecasterFactory:
     """The factory of a sequence's forecasters."""
     return factory.for_sequence(sequence) if isinstance(factory, SequenceFactory) else factory
+
+
+def own_notes(factory: Any, sequences: Sequence[str]) -> list[str]:
+    """What a factory has to say of its forecasts of some sequences."""
+    return factory.notes(sequences) if isinstance(factory, NotedFactory) else []
 
 
 class Hold:

@@ -20,6 +20,7 @@ import numpy as np
 
 from lae_sim.boxes import Floats
 from lae_sim.errors import LaeError
+from lae_sim.examples import video_of
 from lae_sim.files import written_whole
 from lae_sim.window import Window, Windowed
 
@@ -50,6 +51,12 @@ class Learned:
         """Names of the sequences that it was trained on."""
         names: Sequence[str] = self.document["sequences"]
         return names
+
+    def notes(self, sequences: Sequence[str]) -> list[str]:
+        """Whether it was trained on some of these sequences, or on parts of the same videos."""
+        known = {video_of(name) for name in self.trained_on}
+        seen = sum(video_of(name) in known for name in sequences)
+        return [f"trained on {seen} of these {len(sequences)} sequences"] if seen else []
 
     def __call__(self, window: Window, ahead: Floats) -> Floats:
         """Boxes, float64 [P, 4], so many frames [P] after the newest output of each window."""

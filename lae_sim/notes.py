@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from lae_sim.evaluation import Evaluation
-from lae_sim.examples import video_of
-from lae_sim.forecast import AnyFactory
+from lae_sim.forecast import AnyFactory, own_notes
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import Convention
 from lae_sim.run import Run
@@ -79,12 +78,5 @@ def notes_on(
             f"{unknown} of {len(sequences)} sequences"
         )
     for name, factory in forecasters.items():
-        rule = getattr(getattr(factory, "base", factory), "rule", None)  # camera+learned:FILE
-        known = {video_of(sequence) for sequence in getattr(rule, "trained_on", ())}
-        seen = sum(video_of(sequence) in known for sequence in sequences)
-        if seen:
-            notes.append(
-                f"{name} was trained on {seen} of these {len(sequences)} sequences, or on parts "
-                "of the same videos: its scores there promise nothing for others"
-            )
+        notes += [f"{name}: {note}" for note in own_notes(factory, sequences)]
     return notes

@@ -34,12 +34,12 @@ class NetworkTrainer:
     """
 
     steps: int = 1000
-    batch: int = 4096
+    batch: int = 2048
     rate: float = 3e-3
     progress: Callable[[int], object] = lambda steps: None
 
     def fit(self, examples: Examples, seed: int = 0) -> Windowed[Learned]:
-        """Train on all examples; the same seed, machine and threads give the same network.
+        """Train on all examples; the same seed and torch give the same network on like processors.
 
         Raises:
             LaeError: if torch is missing, or there is nothing to learn from.
@@ -53,17 +53,25 @@ class NetworkTrainer:
         inputs = Inputs.of(window, ahead[usable])
         goals = torch.from_numpy(_goals(window.boxes[:, 0], examples, usable))
         weight = torch.from_numpy(examples.weight[usable].astype(np.float32))
-        weight /= weight.mean()
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # sums in one order, whatever the machine; little is lost
+        try:
+            network = self._descend(torch, inputs, goals, weight / weight.mean(), seed)
+        finally:
+            torch.set_num_threads(threads)
+        seen = np.unique(examples.lanes.lane(examples.item[usable]))
+        names = sorted({examples.sequences[lane] for lane in seen})
+        document = {"sequences": names, "seed": seed, "steps": self.steps}
+        return Windowed(Learned(network.eval(), document))
+
+    def _descend(self, torch: Any, inputs: Inputs, goals: Any, weight: Any, seed: int) -> Any:
         generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = new_network()
         optimiser = torch.optim.AdamW(network.parameters(), lr=self.rate, weight_decay=1e-3)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser,
-            self.rate,
-            total_steps=self.steps,
-            pct_start=0.1 + 1e-9,  # torch divides by zero where this is exactly one step
+            optimiser, self.rate, total_steps=self.steps, pct_start=0.1
         )
         for _ in range(self.steps):
             which = torch.randint(len(weight), (self.batch,), generator=generator)
@@ -76,10 +84,7 @@ class NetworkTrainer:
             optimiser.step()
             schedule.step()
             self.progress(1)
-        seen = np.unique(examples.lanes.lane(examples.item[usable]))
-        names = sorted({examples.sequences[lane] for lane in seen})
-        document = {"sequences": names, "seed": seed, "steps": self.steps}
-        return Windowed(Learned(network.eval(), document))
+        return network
 
 
 def _sized(boxes: Floats) -> Bools:

@@ -11,7 +11,7 @@ import numpy as np
 
 from lae_sim.boxes import Bools, Floats
 from lae_sim.engine import Ints
-from lae_sim.forecast import ImageSize, Lanes
+from lae_sim.forecast import ImageSize, Lanes, own_notes
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,10 @@ class Windowed(Generic[AnyRule]):
         """The same for many lanes at once; equal but for rounding."""
         ahead = (frame - lanes.frames[item]).astype(np.float64)
         return self.rule(Window.of(lanes, item, self.rule.size), ahead)
+
+    def notes(self, sequences: Sequence[str]) -> list[str]:
+        """What the rule has to say."""
+        return own_notes(self.rule, sequences)
 
 
 class _Recent:
