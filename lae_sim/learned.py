@@ -192,7 +192,8 @@ def read_learned(path: str | os.PathLike[str]) -> Windowed[Learned]:
         network.load_state_dict(document.pop("network"))
         if not all(parameter.isfinite().all() for parameter in network.parameters()):
             raise ValueError("its weights are not finite")
-        if not all(isinstance(name, str) for name in document["sequences"]):
+        names = document["sequences"]
+        if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
             raise ValueError("its sequences are no names")
     except FileNotFoundError as error:
         raise LaeError(f"{path}: no such file") from error

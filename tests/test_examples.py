@@ -119,9 +119,9 @@ def test_without_some_sequences_their_queries_are_gone_and_the_others_count_as_b
     ("name", "video"),
     [
         ("car1_1", "car1"), ("car1_12", "car1"), ("car1_s", "car1"), ("car1", "car1"),
-        ("Jogging-1", "Jogging"), ("Jogging.2", "Jogging"), ("uav0000074_04320_s", "uav0000074_04320"),
-        ("uav0000074_04320", "uav0000074_04320"), ("GOT-10k_Val_000001", "GOT-10k_Val_000001"),
-        ("Sheep1", "Sheep1"), ("S0101", "S0101"), ("boat_sail", "boat_sail"), ("", ""), ("a_1\n", "a_1\n"),
+        ("Jogging-1", "Jogging"), ("Jogging.2", "Jogging"), ("uav00074_04320_s", "uav00074_04320"),
+        ("uav00074_04320", "uav00074_04320"), ("Val_000001", "Val_000001"), ("Sheep1", "Sheep1"),
+        ("S0101", "S0101"), ("boat_sail", "boat_sail"), ("", ""), ("a_1\n", "a_1\n"),
     ],
 )  # fmt: skip
 def test_the_video_of_a_sequence(name: str, video: str) -> None:

@@ -1,23 +1,10 @@
-import sys
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 import lae_sim
-from lae_sim.errors import LaeError
-from lae_sim.forecast import ConstantVelocity, Hold
-from lae_sim.kalman import Kalman, KalmanLaePvt
 from lae_sim.options import parse_latency, parse_policy
-from lae_sim.zoo import load_forecaster
 
-BUILT_IN = {
-    "hold": Hold,
-    "constant-velocity": ConstantVelocity,
-    "kalman": Kalman,
-    "kalman-lae-pvt": KalmanLaePvt,
-}
 RECORDING = lae_sim.Recording.new(
     "sequence", [[0, 0, 1, 1]] * 4, [[0, 0, 1, 1]] * 4, [90_000_000, 40_000_000, 30_000_000, 2]
 )
@@ -71,52 +58,3 @@ def test_a_policy_that_is_none_is_an_error_that_quotes_it(text):
 def test_a_latency_that_is_none_is_an_error(text):
     with pytest.raises(lae_sim.LaeError):
         parse_latency(text)
-
-
-@pytest.mark.parametrize(("name", "factory"), BUILT_IN.items())
-def test_built_in_names(name: str, factory: Any) -> None:
-    assert load_forecaster(name) is factory
-
-
-def test_a_forecaster_of_an_installed_module() -> None:
-    assert load_forecaster("lae_sim.kalman:Kalman") is Kalman
-    assert load_forecaster("lae_sim.kalman:Kalman.__init__") is Kalman.__init__
-
-
-def test_a_forecaster_of_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "my_forecasters_of_a_test.py").write_text("def make(box, size): ...\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", sys.path[:])
-    factory = load_forecaster("my_forecasters_of_a_test:make")
-    assert factory.__name__ == "make"
-    monkeypatch.delitem(sys.modules, "my_forecasters_of_a_test")
-
-
-@pytest.mark.parametrize(
-    ("name", "problem"),
-    [
-        ("kalmann", "no forecaster 'kalmann': there are hold, constant-velocity, kalman"),
-        ("", "no forecaster ''"),
-        ("no_such_module_here:x", "ModuleNotFoundError"),
-        ("lae_sim.kalman:NoSuch", "AttributeError"),
-        ("lae_sim.kalman:", "AttributeError"),
-        (":Kalman", "ValueError"),
-        ("lae_sim.kalman:RESTART_IOU", "not callable"),
-        ("lae_sim.kalman:Kalman:update", "AttributeError"),
-    ],
-)
-def test_a_wrong_name_says_what_is_wrong(name: str, problem: str) -> None:
-    with pytest.raises(LaeError, match=problem):
-        load_forecaster(name)
-
-
-def test_a_module_that_fails_while_it_is_imported_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "failing_of_a_test.py").write_text("1 / 0\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", sys.path[:])
-    with pytest.raises(LaeError, match="ZeroDivisionError: division by zero"):
-        load_forecaster("failing_of_a_test:make")
