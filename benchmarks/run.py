@@ -7,12 +7,14 @@ several rounds are compared. The input has the size of UAV123: 123 sequences, 11
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,6 @@ from filterpy.kalman import KalmanFilter
 
 from lae_sim import (
     Clock,
-    Kalman,
     Metadata,
     Recording,
     Trace,
@@ -30,9 +31,11 @@ from lae_sim import (
     simulate,
     write_trace,
 )
-from lae_sim.forecast import Lanes
-from lae_sim.kalman import filter_lanes
+from lae_sim.examples import Examples
+from lae_sim.forecast import ForecasterFactory, Lanes, forecast, own
 from lae_sim.report import table
+from lae_sim.training import NetworkTrainer
+from lae_sim.zoo import load_forecaster
 
 SEQUENCES, FRAMES = 123, 112_578
 ELAPSED_NS = 47_000_000
@@ -181,34 +184,67 @@ def dense_filter() -> KalmanFilter:
     return dense
 
 
-def kalman_lines(rounds: int) -> list[list[str]]:
-    """One update of the Kalman filter, alone and over many lanes, against filterpy."""
-    count, lanes = 200, 1000
-    rng = np.random.default_rng(2)
-    boxes = rng.normal(100, 5, (lanes * (count + 1), 4))
-    frames = np.tile(np.arange(count + 1) * 2, lanes)
-    offsets = np.arange(lanes + 1) * (count + 1)
-    many = Lanes(offsets, frames, boxes, np.full((lanes, 2), np.inf))
-    one = boxes[: count + 1].tolist()
+def forecaster_lines(rounds: int) -> list[list[str]]:
+    """An update and a prediction of each forecaster, against filterpy and the paper's speed.
 
-    def streaming() -> None:
-        forecaster = Kalman(one[0])
+    One box after another, and over many lanes at once. The paper's 500 frames/s are 2,000 us.
+    """
+    count, many = 200, 1000
+    rng = np.random.default_rng(2)
+    boxes = rng.normal(100, 5, (many * (count + 1), 4))
+    frames = np.tile(np.arange(count + 1) * 2, many)
+    offsets = np.arange(many + 1) * (count + 1)
+    lanes = Lanes(offsets, frames, boxes, np.full((many, 2), np.inf))
+    one = boxes[: count + 1].tolist()
+    named = ["constant-velocity", "kalman", "kalman-lae-pvt", "kalman:decay=0.99,state=centre"]
+    named += ["least-squares", "g-h", "imm"]
+    factories = {name: load_forecaster(name) for name in named}
+    if importlib.util.find_spec("torch"):
+        examples = Examples(
+            ("s",),
+            lanes.part(0, 1),
+            np.arange(count),
+            frames[1 : count + 1],
+            *(boxes[1 : count + 1] for _ in range(2)),
+        )
+        factories["learned"] = NetworkTrainer(steps=1).fit(examples)
+
+    def streaming(factory: ForecasterFactory) -> None:
+        forecaster = factory(one[0], None)
         for k in range(1, count + 1):
             forecaster.update(2 * k, one[k])
+            forecaster.predict(2 * k + 3)
 
     def filterpy() -> None:
         dense = dense_filter()
         transition, noise = np.eye(8), 4.0 * np.eye(8)
         transition[:4, 4:] = 2 * np.eye(4)
+        ahead = np.eye(8)
+        ahead[:4, 4:] = 3 * np.eye(4)
         for k in range(1, count + 1):
             dense.predict(F=transition, Q=noise)
             dense.update(boxes[k])
+            ahead @ dense.x
 
-    found = medians({"one at a time": streaming, "filterpy": filterpy}, rounds)
-    found[f"{lanes:,} lanes at once"] = (
-        medians({"": lambda: filter_lanes(many)}, rounds)[""] / lanes
-    )
-    return lines("kalman", found, "filterpy", count, "us per update")
+    works = {"kalman in filterpy": filterpy}
+    works |= {name: partial(streaming, factory) for name, factory in factories.items()}
+    found = medians(works, rounds)
+    unit = "us per update and prediction"
+    what = "forecaster, one box at a time"
+    rows = lines(what, found, "kalman in filterpy", count, unit)
+    asked = np.arange(len(frames))
+    together = {
+        name: partial(forecast, factory, lanes, asked, frames + 3)
+        for name, factory in factories.items()
+        if own(factory, "forecast_lanes")
+    }
+    for name, work in together.items():
+        taken = medians({name: work}, min(rounds, 3))[name] / len(asked) * count
+        rows += [
+            [f"forecaster, {many:,} lanes at once", name, f"{taken / count * 1e6:.3f} {unit}"]
+            + [f"{taken / found['kalman in filterpy']:.4f}", ""]
+        ]
+    return rows
 
 
 def lines(
@@ -290,7 +326,7 @@ def main() -> None:
         folder = Path(name)
         trace = folder / "uav123-sized.parquet"
         write_trace(Trace(Metadata.new("30", "every-frame"), recordings(lengths())), trace)
-        found = engine_lines(arguments.rounds) + kalman_lines(arguments.rounds)
+        found = engine_lines(arguments.rounds) + forecaster_lines(arguments.rounds)
         found += process_lines(str(trace), arguments.rounds)
         found += memory_lines(folder, arguments.sequences)
     print(table(["what", "how", "median", "ratio", "target"], found))

@@ -29,6 +29,7 @@ VERSION = 1
 VELOCITIES = 8
 HIDDEN = 128
 _CORRECTION = 0.05  # target sizes per frame: what an output of 1 stands for
+_MIRRORS = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
 _CONTEXT = 4 * VELOCITIES + 2 * VELOCITIES + 3
 
 
@@ -62,13 +63,14 @@ class Learned:
         """Boxes, float64 [P, 4], so many frames [P] after the newest output of each window."""
         import torch
 
-        inputs = Inputs.of(window, ahead)
+        count = len(ahead)
+        signs = torch.tensor(_MIRRORS).repeat_interleave(count, dim=0)
         with torch.inference_mode():
-            change = sum(
-                inputs.mirrored(signs).change(self.network) * torch.tensor([*signs, 1.0, 1.0])
-                for signs in ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
-            )
-        return _moved(window.boxes[:, 0], (change / 4).numpy().astype(np.float64))
+            inputs = Inputs.of(window, ahead).rows(torch.arange(count).repeat(len(_MIRRORS)))
+            change = inputs.mirrored(signs).change(self.network)
+            change[:, :2] *= signs
+            mean = change.reshape(len(_MIRRORS), count, 4).mean(0)
+        return _moved(window.boxes[:, 0], mean.numpy().astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +106,11 @@ class Inputs:
         return cls(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
 
     def mirrored(self, signs: Any) -> Inputs:
-        """The same with x and y multiplied by signs, two numbers or a tensor [P, 2]."""
+        """The same with x and y multiplied by signs, [P, 2]."""
         import torch
 
-        signs = torch.as_tensor(signs).reshape(-1, 1, 2)
-        velocities = torch.cat([self.velocities[..., :2] * signs, self.velocities[..., 2:]], 2)
+        turned = self.velocities[..., :2] * signs[:, None]
+        velocities = torch.cat([turned, self.velocities[..., 2:]], 2)
         return Inputs(velocities, self.intervals, self.ahead, self.shape)
 
     def rows(self, which: Any) -> Inputs:
