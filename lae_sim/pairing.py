@@ -16,6 +16,7 @@ from math import lcm
 import numpy as np
 import numpy.typing as npt
 
+from lae_sim.clock import MAX_INT64
 from lae_sim.engine import Ints, Schedule
 from lae_sim.errors import LaeError
 
@@ -95,8 +96,8 @@ def pair(
         cost_ns: what an answer costs to make of an output; it delays all but the initial box.
 
     Raises:
-        LaeError: if the clocks differ, calls overlap, or the sigmas are not ascending, or too fine
-            or too large for 64-bit integers.
+        LaeError: if the clocks differ, calls overlap, the sigmas are not ascending, or they or the
+            cost are too fine or too large for 64-bit integers.
     """
     if not all(isinstance(sigma, (Fraction, int)) for sigma in sigmas):
         raise LaeError("permitted latencies must be exact: Fraction(1, 2), not 0.5")
@@ -110,6 +111,8 @@ def pair(
     lengths = np.array([schedule.length for schedule in schedules], np.int64)
     cost = cost_ns * schedules[0].clock.ticks_per_ns
     last_ready = max(int(schedule.ready[-1]) for schedule in schedules) + cost
+    if last_ready > MAX_INT64:
+        raise LaeError(f"forecasting cannot cost {cost_ns:g} ns: the clock ends before")
     largest = max(last_ready // interval, int(lengths.max())) * scale
     most_sigma = max(map(abs, numerators))
     if max(scale * interval, largest + most_sigma) >= _NEVER or most_sigma > MOST_FRAMES * scale:

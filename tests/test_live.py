@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
+from time import perf_counter_ns
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +16,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lae_sim.clock import Clock
-from lae_sim.engine import Policy
+from lae_sim.engine import Policy, simulate
 from lae_sim.errors import LaeError
-from lae_sim.forecast import ConstantVelocity
+from lae_sim.filters import GH
+from lae_sim.forecast import ConstantVelocity, Oracle
 from lae_sim.frames import ImageSequence
 from lae_sim.kalman import Kalman
 from lae_sim.latency import constant
+from lae_sim.least_squares import LeastSquares
 from lae_sim.live import LiveRun, run_every_frame, run_real_time, search_of
 from lae_sim.metadata import Metadata
 from lae_sim.policies import every, fifo, latest, listed, shrinking_tail, vot_realtime
@@ -26,6 +31,7 @@ from lae_sim.recording import Recording
 from lae_sim.run import Run, replay_sequence, replay_trace
 from lae_sim.timed import Answer, TrackerError
 from lae_sim.trace import Trace, read_trace, write_trace
+from lae_sim.window import Windowed
 
 CLOCK = Clock.at(Fraction(30))
 FRAME_NS = 33_333_334  # a little more than an interval at 30 fps
@@ -274,6 +280,75 @@ def test_a_pre_forecaster_that_fails(call: str, answer: object, message: str) ->
     setattr(Failing, call, fail)
     with pytest.raises(LaeError, match=message):
         run_every_frame(bright_sequence(PATH), FakeTimed(), pre_forecaster=Failing)
+
+
+@pytest.mark.parametrize("cost", [0, 1, 300_000, 50_000_000])
+def test_what_a_pre_forecaster_is_declared_to_cost_is_added_to_all_frames_but_the_first(
+    cost: int,
+) -> None:
+    def busy(frame: int) -> int:
+        return FRAME_NS - 2 + (cost if frame else 0)
+
+    expected = simulate(30, CLOCK, busy, latest)
+    options: dict[str, Any] = {"pre_forecaster": Kalman, "forecaster_ns": cost}
+    run = run_real_time(bright_sequence(PATH), FakeTimed([FRAME_NS - 2]), CLOCK, **options)
+    assert run.frames.tolist() == expected.frames.tolist()
+    assert run.recording.elapsed_ns[run.frames].tolist() == expected.elapsed_ns.tolist()
+    assert set(run.measured_ns.tolist()) == {FRAME_NS - 2}
+    assert (len(run.frames) < 30) == (cost > 1_000_000)
+    assert_equal(stored(run, latest, "real-time" if cost > 1_000_000 else "every-frame"), run)
+    times = run_every_frame(
+        bright_sequence(PATH), FakeTimed(), service=lambda frame: 7, **options
+    ).recording.elapsed_ns
+    assert times.tolist() == [7] + [7 + cost] * 29
+    del options["pre_forecaster"]  # then there is nothing to pay
+    run = run_real_time(bright_sequence(PATH), FakeTimed([FRAME_NS - 2]), CLOCK, **options)
+    assert run.recording.elapsed_ns.tolist() == [FRAME_NS - 2] * 30
+
+
+def test_what_a_pre_forecaster_costs_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each prediction and each update is timed; where nothing is found there is no update."""
+    path = [*PATH[:4], (-50.0, -50.0), *PATH[5:9]]
+    now = iter(range(0, 10**12, 7_000))
+    monkeypatch.setattr("lae_sim.live.perf_counter_ns", lambda: next(now))
+    run = run_every_frame(
+        bright_sequence(path), FakeTimed([5]), pre_forecaster=Kalman, forecaster_ns=None
+    )
+    assert run.lost.tolist() == [4]
+    expected = [5] + [5 + 14_000] * 8
+    expected[4] = 5 + 7_000
+    assert run.recording.elapsed_ns.tolist() == expected
+    assert set(run.measured_ns.tolist()) == {5}
+
+
+def test_a_measured_cost_moves_the_schedule() -> None:
+    class Slow(ConstantVelocity):
+        def predict(self, frame: int) -> Sequence[float]:
+            end = perf_counter_ns() + 5_000_000
+            while perf_counter_ns() < end:
+                pass
+            return super().predict(frame)
+
+    options = {"pre_forecaster": Slow, "service": lambda frame: 33_000_000}
+    for forecaster_ns, skips in ((0, False), (None, True)):
+        run = run_real_time(
+            bright_sequence(PATH), FakeTimed(), CLOCK, forecaster_ns=forecaster_ns, **options
+        )
+        assert (len(run.frames) < 30) == skips
+        assert (run.recording.elapsed_ns[run.frames[1:]] > 38_000_000).all() == skips
+
+
+@pytest.mark.parametrize("factory", [Oracle, GH(), Windowed(LeastSquares())], ids=str)
+def test_any_forecaster_may_be_the_pre_forecaster_and_is_new_in_each_pass(factory: Any) -> None:
+    tracker = FakeTimed(reach=3.0)
+    closed = run_every_frame(bright_sequence(PATH), tracker, pre_forecaster=factory)
+    assert closed.lost.tolist() == []
+    again = run_every_frame(bright_sequence(PATH), tracker, pre_forecaster=factory)
+    np.testing.assert_array_equal(again.recording.boxes, closed.recording.boxes)
+    if factory is Oracle:
+        truth = bright_sequence(PATH).truth[1:]
+        searches = [search_of(box, (96, 64)) for box in truth]
+        np.testing.assert_array_equal(tracker.searches, searches * 2)
 
 
 def test_a_search_stays_within_the_image() -> None:

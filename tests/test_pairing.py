@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -108,6 +109,44 @@ def test_at_arrival_latency_plays_no_part(world: World, sigmas: list[Fraction]) 
             for i in range(schedule.length)
         ]
         assert psis(pairing, 0, m) == expected
+
+
+COSTS = st.one_of(
+    st.sampled_from([0, 1, 33_333_333, 33_333_334, 40_000_000]), st.integers(0, 200_000_000)
+)
+
+
+@given(several_worlds(), SIGMAS, COSTS)
+@settings(max_examples=40)
+def test_what_an_answer_costs_delays_it(
+    group: list[World], sigmas: list[Fraction], cost_ns: int
+) -> None:
+    schedules = [schedule_of(world) for world in group]
+    found = pair(schedules, sigmas, cost_ns=cost_ns)
+    for s, (fps, elapsed, _) in enumerate(group):
+        cost = Fraction(cost_ns, 10**9)
+        done = [
+            (frame, start, ready + cost) for frame, start, ready in schedule_latest(fps, elapsed)
+        ]
+        for m, sigma in enumerate(sigmas):
+            assert psis(found, s, m) == psi(done, fps, len(elapsed), sigma)
+    ticks = cost_ns * schedules[0].clock.ticks_per_ns
+    later = [replace(s, start=s.start + ticks, ready=s.ready + ticks) for s in schedules]
+    for name, expected in vars(pair(later, sigmas)).items():
+        np.testing.assert_array_equal(getattr(found, name), expected)
+
+
+def test_a_cost_beyond_the_clock_is_refused() -> None:
+    schedule = simulate(4, CLOCK, lambda frame: 47_000_000, latest)
+    assert psis(pair([schedule], ZERO, cost_ns=10**17), 0, 0) == [0] * 4
+    with pytest.raises(LaeError, match="cannot cost 1e\\+21 ns"):
+        pair([schedule], ZERO, cost_ns=10**21)
+
+
+def test_where_latency_is_not_scored_a_cost_is_not_either() -> None:
+    schedule = simulate(9, CLOCK, lambda frame: 47_000_000, latest)
+    free, dear = (pair([schedule], ZERO, True, cost) for cost in (0, 10**9))
+    np.testing.assert_array_equal(free.first, dear.first)
 
 
 def test_equality_counts() -> None:
