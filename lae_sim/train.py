@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from fractions import Fraction
 from functools import partial
+from pathlib import Path
 
 from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.clock import parse_fps, parse_rational
@@ -87,6 +88,8 @@ def _train(arguments: argparse.Namespace) -> None:
     from lae_sim.training import NetworkTrainer
 
     check_distinct([arguments.out], arguments.traces)
+    if not Path(arguments.out).resolve().parent.is_dir():  # training may take long
+        raise LaeError(f"cannot write {arguments.out}: its folder is not there")
     world = World(
         {name: parse_latency(name) for name in arguments.latency},
         arguments.latency_scale,
