@@ -67,7 +67,7 @@ class Learned:
         signs = torch.tensor(_MIRRORS).repeat_interleave(count, dim=0)
         with torch.inference_mode():
             inputs = Inputs.of(window, ahead).rows(torch.arange(count).repeat(len(_MIRRORS)))
-            change = inputs.mirrored(signs).change(self.network)
+            change = inputs.stretched(signs).change(self.network)
             change[:, :2] *= signs
             mean = change.reshape(len(_MIRRORS), count, 4).mean(0)
         return _moved(window.boxes[:, 0], mean.numpy().astype(np.float64))
@@ -105,13 +105,22 @@ class Inputs:
         parts = (velocities, intervals, np.maximum(ahead, 0), np.stack(shape, axis=1))
         return cls(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
 
-    def mirrored(self, signs: Any) -> Inputs:
-        """The same with x and y multiplied by signs, [P, 2]."""
+    def stretched(self, factors: Any) -> Inputs:
+        """The same with the motion in x and y multiplied by factors, [P, 2]; -1 mirrors it."""
         import torch
 
-        turned = self.velocities[..., :2] * signs[:, None]
-        velocities = torch.cat([turned, self.velocities[..., 2:]], 2)
+        moved = self.velocities[..., :2] * factors[:, None]
+        velocities = torch.cat([moved, self.velocities[..., 2:]], 2)
         return Inputs(velocities, self.intervals, self.ahead, self.shape)
+
+    def flipped(self, which: Any) -> Inputs:
+        """The same with x and y exchanged in some windows, bool [P]."""
+        import torch
+
+        exchanged = self.velocities[..., [1, 0, 3, 2]]
+        velocities = torch.where(which[:, None, None], exchanged, self.velocities)
+        shape = torch.where(which[:, None], self.shape * torch.tensor([1.0, -1.0]), self.shape)
+        return Inputs(velocities, self.intervals, self.ahead, shape)
 
     def rows(self, which: Any) -> Inputs:
         """Some of the windows."""

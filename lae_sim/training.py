@@ -30,12 +30,16 @@ class NetworkTrainer:
         steps: steps of gradient descent.
         batch: queries of each.
         rate: largest learning rate.
+        faster: motion is made faster or slower by a random factor; the standard deviation of its
+            logarithm. It is mirrored, too, and x and y change places, since motion that is not in
+            the traces may come as well.
         progress: told after each step how many more are done.
     """
 
     steps: int = 1000
     batch: int = 2048
     rate: float = 3e-3
+    faster: float = 0.3
     progress: Callable[[int], object] = lambda steps: None
 
     def fit(self, examples: Examples, seed: int = 0) -> Windowed[Learned]:
@@ -56,7 +60,7 @@ class NetworkTrainer:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # sums in one order, whatever the machine; little is lost
         try:
-            network = self._descend(torch, inputs, goals, weight / weight.mean(), seed)
+            network = self._descend(torch, inputs, goals, weight, seed)
         finally:
             torch.set_num_threads(threads)
         seen = np.unique(examples.lanes.lane(examples.item[usable]))
@@ -71,14 +75,24 @@ class NetworkTrainer:
             network = new_network()
         optimiser = torch.optim.AdamW(network.parameters(), lr=self.rate, weight_decay=1e-3)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, self.rate, total_steps=self.steps, pct_start=0.1
+            optimiser,
+            self.rate,
+            total_steps=self.steps,
+            pct_start=0.1 + 1e-9,  # torch divides by zero where this is exactly one step
         )
+        cumulative = torch.cumsum(weight.double(), 0)
         for _ in range(self.steps):
-            which = torch.randint(len(weight), (self.batch,), generator=generator)
+            drawn = torch.rand(self.batch, generator=generator, dtype=torch.float64)
+            which = torch.searchsorted(cumulative, drawn * cumulative[-1]).clamp(
+                max=len(weight) - 1
+            )
             signs = 1.0 - 2.0 * torch.randint(2, (self.batch, 2), generator=generator)
-            change = inputs.rows(which).mirrored(signs).change(network)
-            change = torch.cat([change[:, :2] * signs, change[:, 2:]], 1)
-            loss = (_loss(change, goals[which]) * weight[which]).mean()
+            faster = torch.exp(self.faster * torch.randn(self.batch, 1, generator=generator))
+            flipped = torch.rand(self.batch, generator=generator) < 0.5
+            shown = inputs.rows(which).stretched(signs * faster).flipped(flipped)
+            goal = goals[which] * torch.cat([signs * faster, torch.ones(self.batch, 4)], 1)[:, None]
+            goal = torch.where(flipped[:, None, None], goal[..., [1, 0, 3, 2, 5, 4]], goal)
+            loss = _loss(shown.change(network), goal).mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
