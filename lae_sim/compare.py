@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli import argument, exit_status, new_parser
-from lae_sim.clock import parse_fps, parse_rational
+from lae_sim.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, labels
-from lae_sim.options import add_forecasting, parse_latency, parse_policy, whole
+from lae_sim.options import add_forecasting, add_worlds, parse_policy, parse_world, whole
 from lae_sim.zoo import FORECASTERS, find_frames, load_any
 
 if TYPE_CHECKING:
@@ -55,25 +55,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
     add_forecasting(made)
-    world = made.add_argument_group("the world and the tracker")
-    add = world.add_argument
-    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
-    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
-    add(
-        "--latency",
-        nargs="+",
-        default=["recorded"],
-        metavar="SOURCE",
-        help="processing times, one after another: recorded, constant:47ms, ... as in replay",
-    )
-    add(
-        "--latency-scale",
-        nargs="+",
-        type=argument(parse_rational),
-        default=[Fraction(1)],
-        metavar="FACTOR",
-        help="exact factors on all times, one after another",
-    )
+    add_worlds(made, [Fraction(1)])
     scores = made.add_argument_group("scores")
     add = scores.add_argument
     sigma = scores.add_mutually_exclusive_group()
@@ -156,16 +138,11 @@ def _table(
     """Compare, with a progress bar if the standard error stream is a terminal."""
     from tqdm import tqdm
 
-    from lae_sim.comparison import World, compare, steps
+    from lae_sim.comparison import compare, steps
     from lae_sim.metrics import find_convention
     from lae_sim.pairing import SIGMA_GRID
 
-    world = World(
-        {name: parse_latency(name) for name in dict.fromkeys(arguments.latency)},
-        list(dict.fromkeys(arguments.latency_scale)),
-        arguments.fps,
-        parse_policy(arguments.policy)[0],
-    )
+    world = parse_world(arguments)
     sigmas = SIGMA_GRID if arguments.sigma_grid else sorted(set(arguments.sigma))
     total = steps(traces, forecasters, world, arguments.folds)
     with tqdm(total=total, unit=" steps", disable=None) as bar:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from lae_sim.clock import parse_duration, parse_fps, parse_rational
 from lae_sim.errors import LaeError
 
 if TYPE_CHECKING:
+    from lae_sim.comparison import World
     from lae_sim.engine import Policy
     from lae_sim.latency import LatencySource
 
@@ -39,6 +41,51 @@ def add_world(parser: argparse.ArgumentParser) -> None:
         metavar="TRACE",
         help="passes on every N-th frame (lae-sim profile --stride): each sequence's boxes come "
         "from the pass that is nearest to the frames skipped",
+    )
+
+
+def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> None:
+    """Add what decides several replays, one after another.
+
+    Args:
+        parser: the command line.
+        scales: exact factors on all times, by default.
+    """
+    world = parser.add_argument_group("the world and the tracker")
+    add = world.add_argument
+    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
+    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
+    add(
+        "--latency",
+        nargs="+",
+        default=["recorded"],
+        metavar="SOURCE",
+        help="processing times, one after another: recorded, constant:47ms, ... as in replay",
+    )
+    add(
+        "--latency-scale",
+        nargs="+",
+        type=argument(parse_rational),
+        default=list(scales),
+        metavar="FACTOR",
+        help="exact factors on all times, one after another "
+        f"(default: {' '.join(map(str, scales))})",
+    )
+
+
+def parse_world(arguments: argparse.Namespace) -> World:
+    """How traces are replayed, from the arguments of :func:`add_worlds`.
+
+    Raises:
+        LaeError: if there is no such policy or latency.
+    """
+    from lae_sim.comparison import World
+
+    return World(
+        {name: parse_latency(name) for name in dict.fromkeys(arguments.latency)},
+        list(dict.fromkeys(arguments.latency_scale)),
+        arguments.fps,
+        parse_policy(arguments.policy)[0],
     )
 
 

@@ -10,10 +10,9 @@ from functools import partial
 from pathlib import Path
 
 from lae_sim.cli import argument, exit_status, new_parser
-from lae_sim.clock import parse_fps, parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct
-from lae_sim.options import parse_latency, parse_policy, whole
+from lae_sim.options import add_worlds, parse_world, whole
 
 PROGRAM = "lae-sim train"
 
@@ -40,23 +39,6 @@ def parser() -> argparse.ArgumentParser:
     add("--out", required=True, metavar="FILE", help="the trained forecaster, such as f.pt")
     add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
     add("--exclude", nargs="+", default=[], metavar="NAME", help="all sequences but these")
-    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
-    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
-    add(
-        "--latency",
-        nargs="+",
-        default=["recorded"],
-        metavar="SOURCE",
-        help="processing times to train for, as in compare (default: recorded)",
-    )
-    add(
-        "--latency-scale",
-        nargs="+",
-        type=argument(parse_rational),
-        default=[Fraction(1, 2), Fraction(1), Fraction(2)],
-        metavar="FACTOR",
-        help="exact factors on all times to train for (default: 1/2 1 2)",
-    )
     add(
         "--steps",
         type=argument(partial(whole, least=1)),
@@ -66,6 +48,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--seed", type=argument(whole), default=0, help="of the training (default: 0)")
     add("--json", action="store_true", help="print what was done as JSON")
+    add_worlds(made, [Fraction(1, 2), Fraction(1), Fraction(2)])
     return made
 
 
@@ -81,7 +64,6 @@ def _train(arguments: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from lae_sim import __version__
-    from lae_sim.comparison import World
     from lae_sim.examples import Examples
     from lae_sim.learned import Learned, write_learned
     from lae_sim.trace import read_trace
@@ -90,12 +72,7 @@ def _train(arguments: argparse.Namespace) -> None:
     check_distinct([arguments.out], arguments.traces)
     if not Path(arguments.out).resolve().parent.is_dir():  # training may take long
         raise LaeError(f"cannot write {arguments.out}: its folder is not there")
-    world = World(
-        {name: parse_latency(name) for name in arguments.latency},
-        arguments.latency_scale,
-        arguments.fps,
-        parse_policy(arguments.policy)[0],
-    )
+    world = parse_world(arguments)
     traces = [read_trace(path, arguments.sequence) for path in arguments.traces]
     examples = Examples.joined(
         [Examples.of(runs) for trace in traces for *_, runs in world.replays(trace)]
