@@ -52,7 +52,7 @@ def rows_of(examples: Examples) -> Rows:
 
 
 @given(data=st.data())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_examples_are_what_a_plain_loop_over_the_frames_finds(data: st.DataObject) -> None:
     fps, *first = data.draw(worlds(20))
     group = [first, *(data.draw(worlds(12))[1:] for _ in range(data.draw(st.integers(0, 2))))]

@@ -117,7 +117,7 @@ COSTS = st.one_of(
 
 
 @given(several_worlds(), SIGMAS, COSTS)
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_what_an_answer_costs_delays_it(
     group: list[World], sigmas: list[Fraction], cost_ns: int
 ) -> None:

@@ -186,7 +186,7 @@ def told(forecasters: Sequence[Any], lanes: Lanes) -> list[Told]:
 
 @pytest.mark.parametrize("name", [*BUILT_IN, *MADE, "learned"])
 @given(case=lanes_and_queries(), data=st.data())
-@settings(max_examples=12)
+@settings(max_examples=6)
 def test_no_state_leaks_from_one_sequence_to_another(
     name: str, case: Any, data: st.DataObject, request: Any
 ) -> None:
