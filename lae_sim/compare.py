@@ -108,7 +108,11 @@ def _compare(arguments: argparse.Namespace) -> None:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse what would only fail after the work."""
-    check_distinct([path for path in (arguments.out, arguments.plot) if path], arguments.traces)
+    outputs = [path for path in (arguments.out, arguments.plot) if path]
+    check_distinct(outputs, arguments.traces)
+    for path in outputs:
+        if not Path(path).resolve().parent.is_dir():
+            raise LaeError(f"cannot write {path}: its folder is not there")
     if arguments.out and Path(arguments.out).suffix not in (".csv", ".parquet"):
         raise LaeError(f"--out {arguments.out}: name a .csv or .parquet file")
     if arguments.plot:
