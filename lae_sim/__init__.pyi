@@ -1,5 +1,6 @@
 from .boxes import iou
 from .clock import Clock, parse_duration, parse_fps, parse_rational
+from .comparison import World, compare
 from .datasets import find_dataset
 from .device import describe_device
 from .drawing import draw_frame, film_strip
@@ -27,6 +28,7 @@ from .policies import every, fifo, latest, shrinking_tail, vot_realtime
 from .recording import Recording
 from .render import Scene
 from .run import Run, replay_sequence, replay_trace
+from .statistics import by_attribute, comparison_table, summarise
 from .synthetic import synthetic_dataset
 from .trace import Trace, read_trace, validate, write_trace
 from .worker import InProcess, Worker
@@ -66,9 +68,13 @@ __all__ = [
     "Trace",
     "TraceError",
     "Worker",
+    "World",
     "answers",
+    "by_attribute",
     "by_call",
     "by_frame",
+    "compare",
+    "comparison_table",
     "constant",
     "describe_device",
     "draw_frame",
@@ -97,6 +103,7 @@ __all__ = [
     "shrinking_tail",
     "simulate",
     "success_curve",
+    "summarise",
     "synthetic_dataset",
     "validate",
     "vot_realtime",

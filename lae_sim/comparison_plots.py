@@ -69,12 +69,25 @@ def overview(summary: pd.DataFrame, metric: str = "auc") -> Figure:
     return figure
 
 
-def against(summary: pd.DataFrame, x: Literal["scale", "sigma"], metric: str = "auc") -> Figure:
-    """The mean over the latency's scale or the permitted latency, intervals as bands.
+def against(
+    summary: pd.DataFrame,
+    x: Literal["scale", "sigma"],
+    metric: str = "auc",
+    value: Literal["mean", "vs_hold"] = "mean",
+) -> Figure:
+    """A metric over the latency's scale or the permitted latency.
 
-    A panel for each trace (all traces together if there are more than six) and remaining setting.
+    Args:
+        summary: what :func:`lae_sim.statistics.summarise` gave. There is a panel for each trace
+            (for all traces together if there are more than six) and each remaining setting.
+        x: the scale of the latency, or the permitted latency.
+        metric: whose.
+        value: the mean, or its paired difference to hold with the interval as a band. (A mean has
+            no band: how far sequences differ says little of how far forecasters do.)
     """
     chosen = _few_traces(summary[summary["metric"] == metric])
+    if value == "vs_hold":
+        chosen = chosen[chosen["forecaster"] != "offline"]
     styles = _styles(chosen)
     other = "sigma" if x == "scale" else "scale"
     groups = list(chosen.groupby(["trace", "latency", other], sort=False))
@@ -86,18 +99,17 @@ def against(summary: pd.DataFrame, x: Literal["scale", "sigma"], metric: str = "
         for name, style in styles.items():
             one = group[group["forecaster"] == name].sort_values(x)
             if len(one) > 12:
-                style = {key: value for key, value in style.items() if key != "marker"}
-            axes.plot(one[x], one["mean"], label=name, **style)
-            if name != "offline":
-                axes.fill_between(
-                    one[x], one["low"], one["high"], color=style["color"], alpha=0.1, linewidth=0
-                )
+                style = {key: its for key, its in style.items() if key != "marker"}
+            axes.plot(one[x], one[value], label=name, **style)
+            if value == "vs_hold":
+                ends = one["vs_hold_low"], one["vs_hold_high"]
+                axes.fill_between(one[x], *ends, color=style["color"], alpha=0.12, linewidth=0)
         axes.grid(alpha=0.3)
         axes.set(
             xlabel="scale of the latency"
             if x == "scale"
             else r"permitted latency $\sigma$ (frames)",
-            ylabel=_label(metric),
+            ylabel=_label(metric) + (" minus that of hold" if value == "vs_hold" else ""),
         )
     _legend(figure, panels[0], styles)
     return figure
@@ -148,6 +160,7 @@ def attribute_bars(
         axes.set(
             xlabel=_SHARE_LABEL if factor == 100 else _label(metric), ylim=(places[-1] + 0.5, -0.5)
         )
+        axes.axvline(0, color="0.4", linewidth=0.8)
         axes.set_yticks(places, [f"{name} (n = {count})" for name, count in counts.items()])
         axes.grid(axis="x", alpha=0.3)
         axes.set_axisbelow(True)

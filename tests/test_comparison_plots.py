@@ -66,16 +66,21 @@ def test_what_is_not_known_without_offline():
 
 
 @pytest.mark.parametrize("x", ["scale", "sigma"])
-def test_against_draws_a_line_and_a_band_per_forecaster(x):
+@pytest.mark.parametrize("value", ["mean", "vs_hold"])
+def test_against_draws_a_line_per_forecaster_and_bands_of_differences(x, value):
     rows = table(2, scales=(2.0, 1.0), sigmas=(0.0, 0.5, 1.0))
     summary = summarise(rows, resamples=10)
-    figure = against(summary, x)
+    figure = against(summary, x, value=value)
     assert len(figure.axes) == 3 * (3 if x == "scale" else 2)
     first = figure.axes[0]
-    assert [line.get_label() for line in first.lines] == ["hold", "kalman", "mine", "offline"]
-    assert [line.get_linestyle() for line in first.lines] == ["-", "-", "-", "--"]
-    assert len(first.collections) == 3
+    names = ["hold", "kalman", "mine", "offline"][: 4 if value == "mean" else 3]
+    assert [line.get_label() for line in first.lines] == names
+    assert [line.get_linestyle() for line in first.lines] == ["-", "-", "-", "--"][: len(names)]
+    assert len(first.collections) == (0 if value == "mean" else 3)
     assert list(first.lines[0].get_xdata()) == ([1, 2] if x == "scale" else [0, 0.5, 1])
+    at = {"trace": "trace 0", "scale": 1.0, "sigma": 0.0, "forecaster": "mine"}
+    [row] = summary[(summary[list(at)] == pd.Series(at)).all(axis=1)].to_dict("records")
+    assert first.lines[2].get_ydata()[0] == row[value]
 
 
 @pytest.mark.parametrize(
