@@ -89,13 +89,22 @@ class Examples:
         )
 
     def without(self, sequences: Collection[str]) -> Examples:
-        """The queries of all sequences but some; the lanes stay."""
-        kept_lanes = np.array([name not in sequences for name in self.sequences])
-        kept = kept_lanes[self.lanes.lane(self.item)]
+        """All but some sequences: neither their outputs nor their truth is left."""
+        kept = np.array([name not in sequences for name in self.sequences])
+        sizes = np.diff(self.lanes.offsets)
+        kept_items = np.repeat(kept, sizes)
+        lanes = Lanes(
+            np.concatenate([[0], np.cumsum(sizes[kept])]),
+            self.lanes.frames[kept_items],
+            self.lanes.boxes[kept_items],
+            self.lanes.image_sizes[kept],
+        )
+        asked = kept_items[self.item]
         return Examples(
-            self.sequences,
-            self.lanes,
-            *(getattr(self, name)[kept] for name in ("item", "frame", "truth", "boxes")),
+            tuple(name for name, its in zip(self.sequences, kept) if its),
+            lanes,
+            (np.cumsum(kept_items) - 1)[self.item[asked]],
+            *(getattr(self, name)[asked] for name in ("frame", "truth", "boxes")),
         )
 
     @property

@@ -19,7 +19,7 @@ class LeastSquares:
 
     Discounted least squares (Brown, "Smoothing, Forecasting and Prediction of Discrete Time
     Series", 1963) with Huber's loss ("Robust Estimation of a Location Parameter", 1964) by
-    iteratively reweighted least squares, for centre, width and height each.
+    four rounds of iteratively reweighted least squares, for centre, width and height each.
 
     Attributes:
         n: outputs before the newest one.

@@ -63,9 +63,7 @@ class NetworkTrainer:
             network = self._descend(torch, inputs, goals, weight, seed)
         finally:
             torch.set_num_threads(threads)
-        seen = np.unique(examples.lanes.lane(examples.item[usable]))
-        names = sorted({examples.sequences[lane] for lane in seen})
-        document = {"sequences": names, "seed": seed, "steps": self.steps}
+        document = {"sequences": sorted(set(examples.sequences)), "seed": seed, "steps": self.steps}
         return Windowed(Learned(network.eval(), document))
 
     def _descend(self, torch: Any, inputs: Inputs, goals: Any, weight: Any, seed: int) -> Any:
@@ -157,8 +155,14 @@ class KalmanTrainer:
     state: tuple[str, ...] = ("corner", "centre")
 
     def fit(self, examples: Examples, seed: int = 0) -> ForecasterFactory:
-        """The filter that suits all examples best; the seed plays no part."""
+        """The filter that suits all examples best; the seed plays no part.
+
+        Raises:
+            LaeError: if there is no truth to learn from.
+        """
         valid = np.flatnonzero(_sized(examples.truth))
+        if not len(valid):
+            raise LaeError("there is nothing to learn from: no frame has a truth")
         item, frame, truth = examples.item[valid], examples.frame[valid], examples.truth[valid]
         weight = examples.weight[valid]
         tried: dict[Any, float] = {}
