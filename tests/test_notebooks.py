@@ -9,7 +9,7 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-PICTURES = {"01_replay_a_trace": 3, "02_profile_your_device": 4}
+PICTURES = {"01_replay_a_trace": 3, "02_profile_your_device": 4, "03_compare_forecasters": 7}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
