@@ -44,7 +44,9 @@ def overview(summary: pd.DataFrame, metric: str = "auc") -> Figure:
         for name, style in styles.items():
             one = ours[ours["forecaster"] == name].set_index("setting").reindex(settings)
             if name == "offline":
-                left.hlines(one["mean"], places - 0.42, places + 0.42, label=name, **style)
+                known = one["mean"].notna().to_numpy()
+                ends = places[known] - 0.42, places[known] + 0.42
+                left.hlines(one["mean"][known], *ends, label=name, **style)
                 continue
             _dots(left, places + _offset(answering, name), one, "mean", 1, name, style)
             if name in forecasting:
