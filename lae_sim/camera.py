@@ -143,47 +143,40 @@ def _enlarged(transform: Floats, scale: float) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraCompensated:
-    """A forecaster of the target's motion over the camera's, where that lately helped.
+class Camera:
+    """The camera's motion through sequences whose frames are at hand, estimated when first asked.
 
-    Boxes are mapped to frame 0 by the camera's motion since, the base forecaster works there, and
-    its predictions are mapped to the frame asked for: the centre by the similarity, the sides by
-    its scale. Where the camera follows the target, that is worse than the base forecaster by
-    itself; so both are run, and the one whose forecasts of the last ten outputs were closer, summed
-    over the distances of centres, answers.
-
-    The cost is counted so: the camera's motion is estimated beside the tracker on a core of its
-    own, so that it delays nobody, but is late. The query for frame i knows it up to frame i - lag,
-    and the mean of the last three known steps is repeated from there. The motion up to an output's
-    own frame counts as known with the output: a tracker takes longer than an estimate.
+    The cost is counted so: the motion is estimated beside the tracker on a core of its own, so that
+    it delays nobody, but is late. The query for frame i knows it up to frame i - lag, and the mean
+    of the last three known steps is repeated from there. The motion up to an output's own frame
+    counts as known with the output: a tracker takes longer than an estimate.
 
     Attributes:
-        base: the forecaster of the target's motion. It is told no image size, since what it sees
-            is not the image.
         sequences: the frames at hand, by name. A live tracker's own sequence need not be there.
         fps: the world's frame rate.
         lag: by how many frames the motion is late; by default by what an estimate takes on this
             machine (see :meth:`CameraMotion.lag`). 0 is the ceiling.
-        always: whether the camera's motion counts even where it lately did not help.
         known: the estimates so far, by sequence; other sources, such as a gimbal, may fill it.
     """
 
-    base: AnyFactory
     sequences: Mapping[str, ImageSequence]
     fps: Fraction
     lag: int | None = None
-    always: bool = False
     known: dict[str, CameraMotion] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if self.lag is not None and self.lag < 0:
             raise LaeError(f"the camera's motion cannot be known {-self.lag} frames early")
 
-    def for_sequence(self, sequence: Sequenced) -> ForecasterFactory:
-        """The factory for one sequence; its frames are read the first time only.
+    def lag_of(self, name: str) -> int:
+        """By how many frames the motion of a known sequence is late."""
+        return self.known[name].lag(self.fps) if self.lag is None else self.lag
+
+    def outlooks(self, sequence: Sequenced) -> Complexes:
+        """The map from frame 0 to frame k + d as known at k, complex128 [lag + 1 (d), T (k), 2].
 
         Raises:
-            LaeError: if its frames are not at hand, or not as many as the truth's rows.
+            LaeError: if the sequence's frames are not at hand, or not as many as the truth's rows.
         """
         name = sequence.name
         if name not in self.known:
@@ -192,44 +185,66 @@ class CameraCompensated:
             if images is None:
                 raise LaeError(f"sequence {name!r}: the camera's motion needs its frames")
             self.known[name] = estimate_camera(images)
-        motion = self.known[name]
-        here, seen = len(sequence.truth), len(motion.transforms)
+        transforms = self.known[name].transforms
+        here, seen = len(sequence.truth), len(transforms)
         if here != seen:
             raise LaeError(f"sequence {name!r} has {here} frames here, and {seen} images")
-        lag = motion.lag(self.fps) if self.lag is None else self.lag
+        return _outlooks(transforms, self.lag_of(name))
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCompensated:
+    """A forecaster of the target's motion over the camera's, where that lately helped.
+
+    Boxes are mapped to frame 0 by the camera's motion since, the base forecaster works there, and
+    its predictions are mapped to the frame asked for: the centre by the similarity, the sides by
+    its scale. Where the camera follows the target, that is worse than the base forecaster by
+    itself; so both are run, and the closest of the two answers (see :mod:`lae_sim.closest`).
+
+    Attributes:
+        base: the forecaster of the target's motion. It is told no image size, since what it sees
+            is not the image.
+        camera: the camera's motion.
+        always: whether the camera's motion counts even where it lately did not help.
+    """
+
+    base: AnyFactory
+    camera: Camera
+    always: bool = False
+
+    def for_sequence(self, sequence: Sequenced) -> ForecasterFactory:
+        """The factory for one sequence.
+
+        Raises:
+            LaeError: as :meth:`Camera.outlooks`.
+        """
         base = factory_for(self.base, sequence)
-        moving = _Moving(base, _outlooks(motion.transforms, lag))
+        moving = _Moving(base, self.camera.outlooks(sequence))
         return moving if self.always else Closest((base, moving))
 
     def notes(self, sequences: Sequence[str]) -> list[str]:
         """By how many frames the camera's motion was late on these sequences."""
-        lags = {
-            self.known[name].lag(self.fps) if self.lag is None else self.lag
-            for name in sequences
-            if name in self.known
-        }
-        late = " to ".join(str(lag) for lag in sorted({min(lags), max(lags)})) if lags else ""
-        why = "by what estimating it takes on this machine" if self.lag is None else "as told"
-        told = [f"the camera's motion is known {late} frames late, {why}"] if lags else []
-        return told + own_notes(self.base, sequences)
+        lags = sorted({self.camera.lag_of(n) for n in sequences if n in self.camera.known})
+        why = "by what estimating takes on this machine" if self.camera.lag is None else "as told"
+        late = f"the camera's motion is late by {' or '.join(map(str, lags))} frames, {why}"
+        return [late] * bool(lags) + own_notes(self.base, sequences)
 
 
 @dataclass(frozen=True, eq=False)
 class CameraTrainer:
     """Trains the base forecaster on boxes as they are seen, and runs it over the camera's motion.
 
-    The attributes are those of :class:`CameraCompensated`.
+    Attributes:
+        base: trains the forecaster of the target's motion.
+        camera: the camera's motion.
     """
 
     base: Trainer
-    sequences: Mapping[str, ImageSequence]
-    fps: Fraction
-    known: dict[str, CameraMotion] = field(default_factory=dict, repr=False)
+    camera: Camera
 
     def fit(self, examples: Examples, seed: int) -> CameraCompensated:
         """The forecaster that these examples lead to."""
-        base = self.base.fit(examples, seed)
-        return CameraCompensated(base, self.sequences, self.fps, known=self.known)
+        return CameraCompensated(self.base.fit(examples, seed), self.camera)
 
 
 def _outlooks(transforms: Floats, lag: int) -> Complexes:

@@ -14,7 +14,7 @@ from lae_sim.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, labels
 from lae_sim.options import add_forecasting, add_worlds, parse_policy, parse_world, whole
-from lae_sim.zoo import FORECASTERS, find_frames, load_any
+from lae_sim.zoo import FORECASTERS, find_camera, load_any
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -129,9 +129,11 @@ def _forecasters(
     arguments: argparse.Namespace, traces: Mapping[str, Trace]
 ) -> dict[str, AnyFactory | Trainer]:
     fps = arguments.fps or next(iter(traces.values())).metadata.fps
-    frames = find_frames(arguments.dataset, arguments.root, arguments.sequence)
+    camera = find_camera(
+        arguments.root, arguments.dataset, arguments.sequence, fps, arguments.camera_lag
+    )
     names = dict.fromkeys(["hold", *arguments.forecaster])
-    return {name: load_any(name, frames, fps) for name in names}
+    return {name: load_any(name, camera) for name in names}
 
 
 def _table(
@@ -187,15 +189,23 @@ def _tell(
     import json
 
     from lae_sim import __version__
-    from lae_sim.statistics import by_attribute, comparison_table, summarise
+    from lae_sim.statistics import by_attribute, comparison_table, over_sigmas, summarise
 
-    summary = summarise(table, seed=arguments.seed)
-    divided = None if attributes is None else by_attribute(table, attributes, seed=arguments.seed)
+    metrics, notes = ("auc", "dp20"), table.attrs["notes"]
+    if arguments.sigma_grid:
+        table, metrics = over_sigmas(table), ("mauc", "mdp20")
+    settings: dict[str, Any] = {"metrics": metrics, "seed": arguments.seed}
+    summary = summarise(table, **settings)
+    divided = None if attributes is None else by_attribute(table, attributes, **settings)
     if arguments.plot:
         from lae_sim.comparison_plots import overview
         from lae_sim.plots import save
 
-        save(overview(summary), arguments.plot)
+        save(overview(summary, metrics[0]), arguments.plot)
+    if arguments.sigma_grid:
+        for each in (summary, divided):
+            if each is not None:
+                each["sigma"] = "0, 0.02, ..., 1"
     if arguments.json:
         document: dict[str, Any] = {
             "format": "lae-compare",
@@ -206,7 +216,7 @@ def _tell(
             "policy": arguments.policy,
             "seed": arguments.seed,
             "method": summary.attrs["method"],
-            "notes": table.attrs["notes"],
+            "notes": notes,
             "summary": _records(summary),
         }
         if divided is not None:
@@ -216,11 +226,7 @@ def _tell(
     if divided is not None:
         print(comparison_table(divided), end="\n\n")
     print(comparison_table(summary), end="\n\n")
-    print(
-        "\n".join(
-            [f"convention {arguments.convention}, policy {arguments.policy}", *table.attrs["notes"]]
-        )
-    )
+    print("\n".join([f"convention {arguments.convention}, policy {arguments.policy}", *notes]))
 
 
 def _records(summary: DataFrame) -> list[dict[str, Any]]:

@@ -98,24 +98,7 @@ def compare(
         raise LaeError("there is nothing to compare: name at least one trace")
     if OFFLINE in forecasters:
         raise LaeError(f"{OFFLINE} is the name of the tracker's own scores, not of a forecaster")
-    notes = []
-    trainers = {name: each for name, each in forecasters.items() if isinstance(each, Trainer)}
-    ready: dict[str, Any] = {"hold": Hold, **forecasters}
-    if trainers:
-        parts = [
-            Examples.of(runs) for trace in traces.values() for *_, runs in world.replays(trace)
-        ]
-        examples = Examples.joined(parts)
-        dealt = assign_folds(examples.sequences, folds, seed)
-        count = max(dealt.values()) + 1
-        for name, trainer in trainers.items():
-            ready[name] = cross_fitted(
-                trainer, examples, dealt, seed, partial(progress, f"training {name}")
-            )
-        notes.append(
-            f"{', '.join(trainers)}: trained in {count} folds over {len(dealt)} sequences (parts "
-            f"of a video together), seed {seed}: no sequence is scored by what was trained on it"
-        )
+    ready, notes = fitted(traces, {"hold": Hold, **forecasters}, world, folds, seed, progress)
     tables = []
     for label, trace in traces.items():
         dataset = trace.metadata.dataset
@@ -131,6 +114,38 @@ def compare(
         about = notes_on(found, trace.metadata, convention, ready, at_arrival=False)
         notes += [f"{label}: {note}" for note in about]
     return _joined(tables, notes)
+
+
+def fitted(
+    traces: Mapping[str, Trace],
+    forecasters: Mapping[str, AnyFactory | Trainer],
+    world: World = RECORDED,
+    folds: int = 5,
+    seed: int = 0,
+    progress: Callable[[str], object] = lambda what: None,
+) -> tuple[dict[str, AnyFactory], list[str]]:
+    """Train those forecasters that must be trained, across folds; see :func:`compare`.
+
+    Returns:
+        A factory for each forecaster, and what to say of the training.
+    """
+    ready: dict[str, Any] = dict(forecasters)
+    trainers = {name: each for name, each in forecasters.items() if isinstance(each, Trainer)}
+    if not trainers:
+        return ready, []
+    examples = Examples.joined(
+        [Examples.of(runs) for trace in traces.values() for *_, runs in world.replays(trace)]
+    )
+    dealt = assign_folds(examples.sequences, folds, seed)
+    for name, trainer in trainers.items():
+        told = partial(progress, f"training {name}")
+        ready[name] = cross_fitted(trainer, examples, dealt, seed, told)
+    note = (
+        f"{', '.join(trainers)}: trained in {max(dealt.values()) + 1} folds over {len(dealt)} "
+        f"sequences (parts of a video together), seed {seed}: no sequence is scored by what was "
+        "trained on it"
+    )
+    return ready, [note]
 
 
 def steps(

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,7 +66,7 @@ class Learned:
 
         count = len(ahead)
         signs = torch.tensor(_MIRRORS).repeat_interleave(count, dim=0)
-        with torch.inference_mode():
+        with one_thread(), torch.inference_mode():
             inputs = Inputs.of(window, ahead).rows(torch.arange(count).repeat(len(_MIRRORS)))
             change = inputs.stretched(signs).change(self.network)
             change[:, :2] *= signs
@@ -146,6 +147,19 @@ class Inputs:
         sides = (weights[:, 1, :, None] * self.velocities[..., 2:]).sum(1)
         correction = _CORRECTION * known[:, :1] * told[:, 2 * n :]
         return (torch.cat([centre, sides], 1) + correction) * self.ahead[:, None]
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use one thread: sums in one order whatever the machine, and little is lost."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def new_network() -> Any:

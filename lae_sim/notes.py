@@ -60,8 +60,9 @@ def notes_on(
             + counted
             + (f"; {len(bare)} sequences have none at all, such as {bare[0]!r}" if bare else "")
         )
-    if evaluation.missing.any() and not evaluation.missing.all():
-        notes.append("no offline score: some sequences lack the boxes of skipped frames")
+    if evaluation.missing.any():
+        which = "the trace lacks" if evaluation.missing.all() else "some sequences lack"
+        notes.append(f"no offline score, nothing recovered: {which} the boxes of skipped frames")
     if at_arrival:
         notes.append("vot-realtime skips frames but never scores latency")
     parted = np.flatnonzero(evaluation.disagreement > TRUSTED_DISAGREEMENT)

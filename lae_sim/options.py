@@ -96,6 +96,12 @@ def add_forecasting(parser: argparse.ArgumentParser) -> None:
     add("--root", metavar="PATH", help="folder of the dataset's frames, for camera+NAME")
     add("--dataset", metavar="NAME", help="the dataset in --root, if its folder does not say")
     add(
+        "--camera-lag",
+        type=argument(whole),
+        metavar="FRAMES",
+        help="by which the camera's motion is late (default: by what estimating it takes here)",
+    )
+    add(
         "--cost",
         nargs="+",
         default=[],

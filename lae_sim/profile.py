@@ -278,6 +278,7 @@ def _passes(
     arguments: argparse.Namespace, dataset: Dataset, tracker: TimedTracker, out: Path
 ) -> list[Pass]:
     """The first pass and its repetitions, the strided ones and the closed loops."""
+    from lae_sim.camera import Camera
     from lae_sim.clock import Clock
     from lae_sim.files import check_distinct
     from lae_sim.live import run_every_frame, run_real_time
@@ -303,8 +304,8 @@ def _passes(
     common: dict[str, Any] = {"tracker": tracker, "include_decode": arguments.include_decode}
     if arguments.pre_forecaster is not None:
         named, cost = arguments.pre_forecaster, arguments.pre_forecaster_cost
-        frames = {sequence.name: sequence for sequence in dataset.sequences}
-        common["pre_forecaster"] = load_forecaster(named, frames, dataset.fps)
+        camera = Camera({}, dataset.fps)  # a live sequence brings its frames
+        common["pre_forecaster"] = load_forecaster(named, camera)
         common["forecaster_ns"], common["keep_size"] = cost, arguments.keep_size
         document["schedule"] = {
             "pre_forecaster": named,

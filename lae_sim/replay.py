@@ -15,7 +15,7 @@ from lae_sim.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, labels
 from lae_sim.options import add_forecasting, add_world, parse_latency, parse_policy
-from lae_sim.zoo import FORECASTERS, find_frames, load_forecaster
+from lae_sim.zoo import FORECASTERS, find_camera, load_forecaster
 
 if TYPE_CHECKING:
     from lae_sim.clock import Clock
@@ -194,9 +194,11 @@ class _Job:
         if arguments.attributes and not trace.metadata.names_attributes:
             raise LaeError(f"{path}: the trace names no attributes of its sequences")
         fps = arguments.fps or trace.metadata.fps
-        frames = find_frames(arguments.dataset, arguments.root, arguments.sequence)
+        camera = find_camera(
+            arguments.root, arguments.dataset, arguments.sequence, fps, arguments.camera_lag
+        )
         names = dict.fromkeys(["hold", *arguments.forecaster])
-        forecasters = {name: load_forecaster(name, frames, fps) for name in names}
+        forecasters = {name: load_forecaster(name, camera) for name in names}
         return cls(
             path=path,
             label=label,

@@ -22,7 +22,14 @@ if TYPE_CHECKING:
 
 ALL_TRACES = "all traces"
 ALL_SEQUENCES = "all sequences"
-METRIC_LABELS = {"auc": "AUC", "dp20": "DP@20", "norm_dp20": "norm. P", "norm_auc": "norm. AUC"}
+METRIC_LABELS = {
+    "auc": "AUC",
+    "dp20": "DP@20",
+    "norm_dp20": "norm. P",
+    "norm_auc": "norm. AUC",
+    "mauc": "mAUC",
+    "mdp20": "mDP@20",
+}
 _KEYS = ["attribute", "trace", "latency", "scale", "sigma", "forecaster", "metric"]
 _NOISE_DECIMALS = 12  # equal differences of scores in 0..1 are equal to this many decimals
 
@@ -125,6 +132,16 @@ def by_attribute(
     everything = table.assign(attribute=ALL_SEQUENCES)
     divided = pd.concat([everything, chosen.sort_values("attribute", kind="stable")])
     return summarise(divided, **settings)
+
+
+def over_sigmas(table: pd.DataFrame) -> pd.DataFrame:
+    """The tidy table of the plain means over its permitted latencies: metrics mauc, mdp20, ...
+
+    Over 0, 0.02, ..., 1 these are mAUC and mDP of Li et al., "PVT++", 2023. ``sigma`` is 0 in all.
+    """
+    keys = [column for column in table if column not in ("sigma", "value")]
+    means = table.groupby(keys, sort=False)["value"].mean().reset_index()
+    return means.assign(metric="m" + means["metric"], sigma=0.0)
 
 
 def _wide(table: pd.DataFrame, metrics: Sequence[str]) -> tuple[pd.DataFrame, dict[str, list[Any]]]:
@@ -232,7 +249,7 @@ def comparison_table(summary: pd.DataFrame) -> str:
     baselines = [name[3:-7] for name in summary if name.endswith("_better")]
     summary = summary.assign(
         latency=[setting_label(*both) for both in zip(summary["latency"], summary["scale"])],
-        sigma=[f"{sigma:g}" for sigma in summary["sigma"]],
+        sigma=[s if isinstance(s, str) else f"{s:g}" for s in summary["sigma"]],
     )
     settings = ["trace", "latency", "sigma"]
     several = [name for name in settings if summary[name].nunique() > 1]

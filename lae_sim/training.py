@@ -13,7 +13,7 @@ from lae_sim.errors import LaeError
 from lae_sim.examples import Examples
 from lae_sim.forecast import ForecasterFactory
 from lae_sim.kalman import PAPER
-from lae_sim.learned import Inputs, Learned, import_torch, new_network
+from lae_sim.learned import Inputs, Learned, import_torch, new_network, one_thread
 from lae_sim.window import Window, Windowed
 
 
@@ -57,12 +57,8 @@ class NetworkTrainer:
         inputs = Inputs.of(window, ahead[usable])
         goals = torch.from_numpy(_goals(window.boxes[:, 0], examples, usable))
         weight = torch.from_numpy(examples.weight[usable].astype(np.float32))
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # sums in one order, whatever the machine; little is lost
-        try:
+        with one_thread():
             network = self._descend(torch, inputs, goals, weight, seed)
-        finally:
-            torch.set_num_threads(threads)
         document = {"sequences": sorted(set(examples.sequences)), "seed": seed, "steps": self.steps}
         return Windowed(Learned(network.eval(), document))
 

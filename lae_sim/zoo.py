@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +13,9 @@ from lae_sim.options import key_and_value
 from lae_sim.trackers.names import bound, imported, parse_options
 
 if TYPE_CHECKING:
+    from lae_sim.camera import Camera
     from lae_sim.examples import Trainer
     from lae_sim.forecast import AnyFactory
-    from lae_sim.frames import ImageSequence
 
 FORECASTERS = """\
 forecasters:
@@ -47,17 +47,14 @@ _BUILT_IN = {
 _TRAINED = {"learned": "NetworkTrainer", "tuned-kalman": "KalmanTrainer"}
 
 
-def load_forecaster(
-    name: str, frames: Mapping[str, ImageSequence] | None = None, fps: Fraction = Fraction(30)
-) -> AnyFactory:
+def load_forecaster(name: str, camera: Camera | None = None) -> AnyFactory:
     """A forecaster by its name, or a user's own as ``package.module:factory``.
 
     Modules are also looked for in the current folder.
 
     Args:
         name: as in ``FORECASTERS``.
-        frames: image sequences by name, for ``camera+NAME``.
-        fps: the world's frame rate, for the same.
+        camera: the camera's motion, for ``camera+NAME``.
 
     Raises:
         LaeError: if there is none of that name, it must be trained first, its options do not fit,
@@ -65,7 +62,7 @@ def load_forecaster(
     """
     from lae_sim.examples import Trainer
 
-    found = load_any(name, frames, fps)
+    found = load_any(name, camera)
     if isinstance(found, Trainer):
         raise LaeError(
             f"{name} must be trained: lae-sim compare does so on other sequences; lae-sim train "
@@ -74,22 +71,20 @@ def load_forecaster(
     return found
 
 
-def load_any(
-    name: str, frames: Mapping[str, ImageSequence] | None = None, fps: Fraction = Fraction(30)
-) -> AnyFactory | Trainer:
+def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:
     """The same, or a trainer: ``learned``, ``tuned-kalman``, or a user's own class with ``fit``.
 
     Raises:
         LaeError: as :func:`load_forecaster`.
     """
     if name.startswith("camera+"):
-        if frames is None:
+        if camera is None:
             raise LaeError(f"{name} needs the frames: give the dataset's folder with --root")
         from lae_sim.examples import Trainer
 
-        base = load_any(name.removeprefix("camera+"), frames, fps)
+        base = load_any(name.removeprefix("camera+"), camera)
         kind = "CameraTrainer" if isinstance(base, Trainer) else "CameraCompensated"
-        return _attribute("camera", kind)(base, frames, fps)  # type: ignore[no-any-return]
+        return _attribute("camera", kind)(base, camera)  # type: ignore[no-any-return]
     if name in _TRAINED:
         return _attribute("training", _TRAINED[name])()  # type: ignore[no-any-return]
     kind, colon, value = name.partition(":")
@@ -108,25 +103,32 @@ def load_any(
     return found  # type: ignore[no-any-return]
 
 
-def find_frames(
-    dataset: str | None, root: str | None, sequences: Sequence[str] | None
-) -> dict[str, ImageSequence] | None:
-    """Image sequences by name, for ``camera+NAME``; None without a folder.
+def find_camera(
+    root: str | None,
+    dataset: str | None,
+    sequences: Sequence[str] | None,
+    fps: Fraction,
+    lag: int | None = None,
+) -> Camera | None:
+    """The camera's motion, for ``camera+NAME``; None without a folder of frames.
 
     Args:
-        dataset: what it is called, if its folder does not say.
         root: the dataset's folder, or ``synthetic``.
+        dataset: what it is called, if its folder does not say.
         sequences: those wanted; all by default.
+        fps: the world's frame rate.
+        lag: by how many frames the motion is late; by what estimating it takes if None.
 
     Raises:
         LaeError: as :func:`lae_sim.datasets.find_dataset`.
     """
     if root is None:
         return None
+    from lae_sim.camera import Camera
     from lae_sim.datasets import find_dataset
 
     found = find_dataset(dataset, None if root == "synthetic" else root, sequences)
-    return {sequence.name: sequence for sequence in found.sequences}
+    return Camera({sequence.name: sequence for sequence in found.sequences}, fps, lag)
 
 
 def _built_in(name: str, kind: str, value: str) -> AnyFactory:

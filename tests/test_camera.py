@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fakes import FakeTimed
 
-from lae_sim.camera import CameraCompensated, CameraMotion, CameraTrainer, estimate_camera
+from lae_sim.camera import Camera, CameraCompensated, CameraMotion, CameraTrainer, estimate_camera
 from lae_sim.clock import Clock
 from lae_sim.errors import LaeError
 from lae_sim.forecast import ConstantVelocity, Hold, Lanes, forecast
@@ -58,8 +58,9 @@ def known(steps, elapsed_ns=1_000_000, **options):
     sequence = ImageSequence("known", truth, lambda frame: np.zeros((8, 8, 3), np.uint8))
 
     def make(base, **more):
-        camera = CameraCompensated(base, {}, FPS, known={"known": motion}, **options, **more)
-        return camera.for_sequence(sequence)
+        camera = Camera({}, FPS, options.get("lag", more.get("lag")), {"known": motion})
+        always = options.get("always", more.get("always", False))
+        return CameraCompensated(base, camera, always).for_sequence(sequence)
 
     return make
 
@@ -130,7 +131,7 @@ def test_lag_is_what_nearly_all_estimates_take():
 
 def test_a_still_target_under_a_panning_camera():
     sequence = film([similarity(6, 2)] * 12)
-    camera = CameraCompensated(Hold, {"film": sequence}, FPS, always=True)
+    camera = CameraCompensated(Hold, Camera({"film": sequence}, FPS), always=True)
     forecaster = camera.for_sequence(sequence)(BOX, (320, 240))
     for frame in range(1, 6):
         forecaster.update(frame, shift(BOX, 6 * frame, 2 * frame))
@@ -224,12 +225,12 @@ def test_lanes_and_boxes_one_by_one_agree(base, always):
 
 def test_frames_are_read_once_and_of_the_sequence_itself_where_it_is_live():
     sequence, asked = counted(film([similarity(4, 1)] * 3))
-    camera = CameraCompensated(Hold, {"film": sequence}, FPS)
-    for _ in range(3):
-        camera.for_sequence(sequence)
+    camera = Camera({"film": sequence}, FPS)
+    for base in (Hold, Kalman, Hold):
+        CameraCompensated(base, camera).for_sequence(sequence)
     assert asked == [0, 1, 2, 3]
-    live = CameraCompensated(Kalman, {}, FPS)
-    factory = live.for_sequence(sequence)
+    live = Camera({}, FPS)
+    factory = CameraCompensated(Kalman, live).for_sequence(sequence)
     assert list(live.known) == ["film"]
     tracker = FakeTimed([10_000_000])
     run = run_real_time(sequence, tracker, Clock.at(FPS), pre_forecaster=factory)
@@ -243,7 +244,7 @@ def test_trainers_share_what_is_known():
             return Hold
 
     sequence, asked = counted(film([similarity(4, 1)] * 2))
-    trainer = CameraTrainer(Trainer(), {"film": sequence}, FPS)
+    trainer = CameraTrainer(Trainer(), Camera({"film": sequence}, FPS))
     for seed in range(2):
         trained = trainer.fit(None, seed)
         assert trained.base is Hold
@@ -257,9 +258,9 @@ def test_what_does_not_fit_is_told():
         truth = np.zeros((4, 4))
 
     with pytest.raises(LaeError, match="'elsewhere': the camera's motion needs its frames"):
-        CameraCompensated(Hold, {}, FPS).for_sequence(Recorded())
+        CameraCompensated(Hold, Camera({}, FPS)).for_sequence(Recorded())
     short = film([similarity()] * 2)
     with pytest.raises(LaeError, match="'elsewhere' has 4 frames here, and 3 images"):
-        CameraCompensated(Hold, {"elsewhere": short}, FPS).for_sequence(Recorded())
+        CameraCompensated(Hold, Camera({"elsewhere": short}, FPS)).for_sequence(Recorded())
     with pytest.raises(LaeError, match="cannot be known 1 frames early"):
-        CameraCompensated(Hold, {}, FPS, lag=-1)
+        Camera({}, FPS, lag=-1)

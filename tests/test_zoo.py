@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from walks import lanes_and_queries, streaming
 from witness import moving
 
+from lae_sim.camera import Camera
 from lae_sim.errors import LaeError
 from lae_sim.examples import Trainer
 from lae_sim.filters import GH, IMM
@@ -66,7 +68,8 @@ def test_every_name_that_the_help_lists_is_there(learned: Any, tmp_path: Path) -
         if name == "package.module:factory":
             continue
         frames = {"s": ImageSequence("s", np.array([box]), lambda i: np.zeros((9, 9, 3), np.uint8))}
-        factory = factory_for(load_forecaster(name, frames), frames["s"])
+        camera = Camera(frames, Fraction(30))
+        factory = factory_for(load_forecaster(name, camera), frames["s"])
         assert list(factory(box, None).predict(0)) == pytest.approx(box), name
 
 
