@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -211,6 +211,7 @@ class CameraCompensated:
     base: AnyFactory
     camera: Camera
     always: bool = False
+    sees_frames: ClassVar[bool] = True
 
     def for_sequence(self, sequence: Sequenced) -> ForecasterFactory:
         """The factory for one sequence.

@@ -13,7 +13,7 @@ from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, labels
-from lae_sim.options import add_forecasting, add_worlds, parse_policy, parse_world, whole
+from lae_sim.options import add_forecasting, add_worlds, parse_policy, whole
 from lae_sim.zoo import FORECASTERS, find_camera, load_any
 
 if TYPE_CHECKING:
@@ -132,6 +132,9 @@ def _forecasters(
     camera = find_camera(
         arguments.root, arguments.dataset, arguments.sequence, fps, arguments.camera_lag
     )
+    worlds = {(trace.metadata.dataset, trace.metadata.fps) for trace in traces.values()}
+    if camera and len(worlds) > 1:
+        raise LaeError("--root is the folder of one dataset: compare its traces by themselves")
     names = dict.fromkeys(["hold", *arguments.forecaster])
     return {name: load_any(name, camera) for name in names}
 
@@ -144,7 +147,7 @@ def _table(
     """Compare, with a progress bar if the standard error stream is a terminal."""
     from tqdm import tqdm
 
-    from lae_sim.comparison import compare, steps
+    from lae_sim.comparison import compare, parse_world, steps
     from lae_sim.metrics import find_convention
     from lae_sim.pairing import SIGMA_GRID
 

@@ -16,14 +16,18 @@ from lae_sim.errors import LaeError
 from lae_sim.evaluation import Evaluation, evaluate
 from lae_sim.examples import Examples, Trainer, assign_folds, cross_fitted
 from lae_sim.forecast import AnyFactory, Hold
+from lae_sim.kalman import TunedKalman
 from lae_sim.latency import LatencySource, by_frame, scaled
 from lae_sim.metrics import METRICS, PYSOT, Convention
 from lae_sim.notes import notes_on
+from lae_sim.options import parse_latency, parse_policy
 from lae_sim.policies import latest
 from lae_sim.run import Run, replay_trace
 from lae_sim.trace import Trace
 
 if TYPE_CHECKING:
+    import argparse
+
     from pandas import DataFrame
 
 OFFLINE = "offline"
@@ -54,6 +58,20 @@ class World:
 
 
 RECORDED = World({"recorded": by_frame})
+
+
+def parse_world(arguments: argparse.Namespace) -> World:
+    """How traces are replayed, from the arguments of :func:`lae_sim.options.add_worlds`.
+
+    Raises:
+        LaeError: if there is no such policy or latency.
+    """
+    return World(
+        {name: parse_latency(name) for name in dict.fromkeys(arguments.latency)},
+        list(dict.fromkeys(arguments.latency_scale)),
+        arguments.fps,
+        parse_policy(arguments.policy)[0],
+    )
 
 
 def compare(
@@ -145,7 +163,12 @@ def fitted(
         f"sequences (parts of a video together), seed {seed}: no sequence is scored by what was "
         "trained on it"
     )
-    return ready, [note]
+    chosen = [
+        f"{name} chose {', '.join(dict.fromkeys(map(str, ready[name].factories)))}"
+        for name in trainers
+        if isinstance(ready[name].factories[0], TunedKalman)
+    ]
+    return ready, [note, *chosen]
 
 
 def steps(

@@ -6,22 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 from time import perf_counter_ns
 
-from lae_sim.clock import parse_duration
 from lae_sim.errors import LaeError, explained
 from lae_sim.forecast import AnyFactory, factory_for
+from lae_sim.options import parse_cost
 from lae_sim.recording import Recording
 
-MEASURED = "measured"
 _ANSWERS = 500
-
-
-def parse_cost(text: str) -> int | None:
-    """A cost such as ``2ms`` in ns, or None for ``measured``.
-
-    Raises:
-        LaeError: if the text is neither.
-    """
-    return None if text == MEASURED else parse_duration(text)
 
 
 def measure_cost(factory: AnyFactory, recording: Recording, name: str = "forecaster") -> int:

@@ -204,6 +204,10 @@ def _answers(
     factory: AnyFactory,
 ) -> tuple[Histories, Pairs, Floats]:
     """The distinct pairs of a forecaster with their boxes, float64 [P, 4]."""
+    if getattr(factory, "sees_frames", False) and pairing.sigmas[0] < 0:
+        raise LaeError(
+            f"{name} sees frames when they arrive: not before, as sigma < 0 would have it"
+        )
     fed = histories(pairing, memoryless=own(factory, "memoryless"))
     found = pairs(pairing, fed)
     boxes = np.concatenate([run.boxes for run in runs])

@@ -140,6 +140,11 @@ class CrossFitted:
         """The factory that was trained without this sequence."""
         return factory_for(self.factories[self.folds[sequence.name]], sequence)
 
+    @property
+    def sees_frames(self) -> bool:
+        """Whether the factories look at frames."""
+        return any(getattr(factory, "sees_frames", False) for factory in self.factories)
+
     def notes(self, sequences: Sequence[str]) -> list[str]:
         """What each fold's factory has to say of the sequences that it scores."""
         notes: dict[str, None] = {}

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Optional, Protocol, runtime_checkable
 
 import numpy as np
@@ -190,27 +191,13 @@ class Oracle:
     @staticmethod
     def for_sequence(sequence: Sequenced) -> ForecasterFactory:
         """The factory that answers with this sequence's truth."""
-        return _Known(sequence.truth)
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    truth: Floats
-
-    def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Forecaster:
-        return _Told(self, box)
-
-    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
-        truth = self.truth[np.minimum(frame, len(self.truth) - 1)]
-        sized = (truth[:, 2] > 0) & (truth[:, 3] > 0)
-        boxes: Floats = np.where(sized[:, None], truth, lanes.boxes[item])
-        return boxes
+        return partial(_Told, sequence.truth)
 
 
 class _Told(Hold):
-    def __init__(self, known: _Known, box: Sequence[float]) -> None:
+    def __init__(self, truth: Floats, box: Sequence[float], image_size: ImageSize = None) -> None:
         super().__init__(box)
-        self._truth = known.truth
+        self._truth = truth
 
     def predict(self, frame: int) -> Sequence[float]:
         truth: list[float] = self._truth[min(frame, len(self._truth) - 1)].tolist()

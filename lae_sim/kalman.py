@@ -35,8 +35,8 @@ class TunedKalman:
         q: process noise; Q = q dt^2 I.
         r: measurement noise; R = r I.
         p0: initial covariance; P0 = p0 I.
-        decay: what is left of the velocity after one frame, above 0 to 1: a damped trend (Gardner
-            and McKenzie, "Forecasting Trends in Time Series", 1985, Eq. 1).
+        decay: what is left of the velocity after one frame, above 0 to 1: a damped trend, after
+            Gardner and McKenzie, "Forecasting Trends in Time Series", 1985.
         state: ``"corner"`` is x, y, w, h; ``"centre"`` is the centre, the logarithm of the scale
             sqrt(w h) and that of the aspect w / h. The gains do not depend on the units, so both
             states share them.

@@ -12,7 +12,6 @@ from lae_sim.clock import parse_duration, parse_fps, parse_rational
 from lae_sim.errors import LaeError
 
 if TYPE_CHECKING:
-    from lae_sim.comparison import World
     from lae_sim.engine import Policy
     from lae_sim.latency import LatencySource
 
@@ -73,20 +72,13 @@ def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> N
     )
 
 
-def parse_world(arguments: argparse.Namespace) -> World:
-    """How traces are replayed, from the arguments of :func:`add_worlds`.
+def parse_cost(text: str) -> int | None:
+    """A cost such as ``2ms`` in ns, or None for ``measured``.
 
     Raises:
-        LaeError: if there is no such policy or latency.
+        LaeError: if the text is neither.
     """
-    from lae_sim.comparison import World
-
-    return World(
-        {name: parse_latency(name) for name in dict.fromkeys(arguments.latency)},
-        list(dict.fromkeys(arguments.latency_scale)),
-        arguments.fps,
-        parse_policy(arguments.policy)[0],
-    )
+    return None if text == "measured" else parse_duration(text)
 
 
 def add_forecasting(parser: argparse.ArgumentParser) -> None:

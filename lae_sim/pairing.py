@@ -109,6 +109,8 @@ def pair(
     numerators = [int(sigma * scale) for sigma in sigmas]
     interval = schedules[0].clock.frame_ticks
     lengths = np.array([schedule.length for schedule in schedules], np.int64)
+    if cost_ns < 0:
+        raise LaeError(f"forecasting cannot cost {cost_ns} ns, less than nothing")
     cost = cost_ns * schedules[0].clock.ticks_per_ns
     last_ready = max(int(schedule.ready[-1]) for schedule in schedules) + cost
     if last_ready > MAX_INT64:

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 from lae_sim import __version__
 from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.clock import NS_PER_SECOND, parse_duration, parse_fps
-from lae_sim.costs import parse_cost
 from lae_sim.errors import LaeError
-from lae_sim.options import key_and_value, parse_box, parse_policy, parse_stride, whole
+from lae_sim.options import key_and_value, parse_box, parse_cost, parse_policy, parse_stride, whole
 from lae_sim.zoo import load_forecaster
 
 if TYPE_CHECKING:

@@ -177,6 +177,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _render(arguments: argparse.Namespace) -> None:
+    from lae_sim.camera import Camera
     from lae_sim.files import check_distinct
 
     inputs = [arguments.trace, *arguments.strided, arguments.timing, arguments.root]
@@ -192,9 +193,11 @@ def _render(arguments: argparse.Namespace) -> None:
             f"{arguments.trace} has {len(runs)} sequences: choose one with --sequence, or give a "
             "folder as --out"
         )
-    forecasters = {name: load_forecaster(name) for name in arguments.forecaster}
+    found = {run.recording.name: _images(run, metadata, arguments) for run in runs}
+    camera = Camera(found, runs[0].schedule.clock.fps)
+    forecasters = {name: load_forecaster(name, camera) for name in arguments.forecaster}
     for run in runs:
-        images = _images(run, metadata, arguments)
+        images = found[run.recording.name]
         scene = Scene.of(run, images, metadata, forecasters, at_arrival)
         if folder:
             out.mkdir(parents=True, exist_ok=True)

@@ -187,6 +187,8 @@ class _Job:
         policy, at_arrival = parse_policy(arguments.policy)
         if at_arrival and any(sigmas):
             raise LaeError("vot-realtime never scores latency: it goes with no permitted latency")
+        if at_arrival and arguments.cost:
+            raise LaeError("vot-realtime never scores latency: it goes with no --cost")
         source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
         trace = read_trace(path, arguments.sequence)
         timing = read_trace(arguments.timing) if arguments.timing else None

@@ -9,6 +9,7 @@ that goes in is described at :func:`lae_sim.comparison.compare`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,8 +54,9 @@ def summarise(
         table: the tidy table; a column ``attribute`` divides the groups further.
         baselines: forecasters that the others are compared with, where the table has them.
         metrics: those to summarise.
-        resamples: of the percentile bootstrap (Efron, "Bootstrap Methods: Another Look at the
-            Jackknife", 1979). A group's depend on ``seed`` and its number of sequences alone.
+        resamples: of the percentile bootstrap (Efron and Tibshirani, "An Introduction to the
+            Bootstrap", 1993, Ch. 13). A group's depend on ``seed`` and its number of sequences
+            alone.
         seed: of NumPy's PCG64.
         confidence: of the intervals, between 0 and 1.
 
@@ -220,21 +222,28 @@ def _compared(
 
 
 def signed_rank_p(differences: Floats) -> float:
-    """Two-sided p of Wilcoxon's signed-rank test ("Individual Comparisons by Ranking", 1945).
+    """Two-sided p of Wilcoxon's signed-rank test.
 
-    Zeros leave first, as Wilcoxon has it; if nothing is left, p is 1. It is exact for fewer than 10
-    differences (one alone has p = 1), and for up to 50 if no two are equally large; else normal.
+    Source: Wilcoxon, "Individual Comparisons by Ranking Methods", 1945. Zeros leave first, as he
+    has it; if nothing is left, p is 1. It is exact for fewer than 10 differences (all signs are
+    tried), and for up to 50 if no two are equally large; else normal.
 
     Args:
         differences: paired, float64 [S].
     """
-    from scipy.stats import wilcoxon
+    from scipy.stats import rankdata, wilcoxon
 
     differences = differences[differences != 0]
-    if not len(differences):
+    count = len(differences)
+    if not count:
         return 1.0
-    distinct = len(np.unique(np.abs(differences)))
-    exact = len(differences) < 10 or distinct == len(differences) <= 50
+    ranks = rankdata(np.abs(differences))
+    if count < 10:
+        sums = np.array(list(product((0, 1), repeat=count))).reshape(-1, count) @ ranks
+        sum_ = ranks[differences > 0].sum()
+        tail = min((sums <= sum_ + 0.25).mean(), (sums >= sum_ - 0.25).mean())
+        return min(1.0, 2 * float(tail))
+    exact = len(np.unique(ranks)) == count <= 50
     # named, since what scipy takes for "auto" changes with its version
     return float(wilcoxon(differences, method="exact" if exact else "approx").pvalue)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct
-from lae_sim.options import add_worlds, parse_world, whole
+from lae_sim.options import add_worlds, whole
 
 PROGRAM = "lae-sim train"
 
@@ -64,6 +64,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from lae_sim import __version__
+    from lae_sim.comparison import parse_world
     from lae_sim.examples import Examples
     from lae_sim.learned import Learned, write_learned
     from lae_sim.trace import read_trace

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim.boxes import Bools, Floats, iou
+from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
 from lae_sim.examples import Examples
 from lae_sim.forecast import ForecasterFactory
@@ -53,16 +54,15 @@ class NetworkTrainer:
         usable = (ahead > 0) & (_sized(examples.truth) | _sized(examples.boxes))
         if not usable.any():
             raise LaeError("there is nothing to learn from: no output answers a later frame")
-        window = Window.of(examples.lanes, examples.item[usable], Learned.size)
-        inputs = Inputs.of(window, ahead[usable])
-        goals = torch.from_numpy(_goals(window.boxes[:, 0], examples, usable))
-        weight = torch.from_numpy(examples.weight[usable].astype(np.float32))
         with one_thread():
-            network = self._descend(torch, inputs, goals, weight, seed)
+            network = self._descend(torch, examples, np.flatnonzero(usable), ahead, seed)
         document = {"sequences": sorted(set(examples.sequences)), "seed": seed, "steps": self.steps}
         return Windowed(Learned(network.eval(), document))
 
-    def _descend(self, torch: Any, inputs: Inputs, goals: Any, weight: Any, seed: int) -> Any:
+    def _descend(
+        self, torch: Any, examples: Examples, usable: Ints, ahead: Floats, seed: int
+    ) -> Any:
+        cumulative = np.cumsum(examples.weight[usable])
         generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -74,17 +74,18 @@ class NetworkTrainer:
             total_steps=self.steps,
             pct_start=0.1 + 1e-9,  # torch divides by zero where this is exactly one step
         )
-        cumulative = torch.cumsum(weight.double(), 0)
         for _ in range(self.steps):
-            drawn = torch.rand(self.batch, generator=generator, dtype=torch.float64)
-            which = torch.searchsorted(cumulative, drawn * cumulative[-1]).clamp(
-                max=len(weight) - 1
-            )
+            drawn = torch.rand(self.batch, generator=generator, dtype=torch.float64).numpy()
+            drawn = np.searchsorted(cumulative, drawn * cumulative[-1])
+            which = usable[np.minimum(drawn, len(usable) - 1)]
+            window = Window.of(examples.lanes, examples.item[which], Learned.size)
+            goal = torch.from_numpy(_goals(window.boxes[:, 0], examples, which))
             signs = 1.0 - 2.0 * torch.randint(2, (self.batch, 2), generator=generator)
             faster = torch.exp(self.faster * torch.randn(self.batch, 1, generator=generator))
             flipped = torch.rand(self.batch, generator=generator) < 0.5
-            shown = inputs.rows(which).stretched(signs * faster).flipped(flipped)
-            goal = goals[which] * torch.cat([signs * faster, torch.ones(self.batch, 4)], 1)[:, None]
+            inputs = Inputs.of(window, ahead[which])
+            shown = inputs.stretched(signs * faster).flipped(flipped)
+            goal = goal * torch.cat([signs * faster, torch.ones(self.batch, 4)], 1)[:, None]
             goal = torch.where(flipped[:, None, None], goal[..., [1, 0, 3, 2, 5, 4]], goal)
             loss = _loss(shown.change(network), goal).mean()
             optimiser.zero_grad()
@@ -101,12 +102,12 @@ def _sized(boxes: Floats) -> Bools:
     return sized
 
 
-def _goals(latest: Floats, examples: Examples, usable: Bools) -> Any:
+def _goals(latest: Floats, examples: Examples, which: Ints) -> Any:
     """Truth and the tracker's own later box as changes from the latest one, float32 [P, 2, 4].
 
     Where one of them is missing the other stands for both.
     """
-    truth, own = examples.truth[usable], examples.boxes[usable]
+    truth, own = examples.truth[which], examples.boxes[which]
     truth = np.where(_sized(truth)[:, None], truth, own)
     own = np.where(_sized(own)[:, None], own, truth)
     goals = np.stack([truth, own], axis=1)
@@ -140,7 +141,8 @@ class KalmanTrainer:
     """Chooses q, decay and state of a :class:`TunedKalman` for the highest mean IoU with the truth.
 
     One parameter after another takes its best value, until none changes; r and p0 stay the paper's,
-    since only their ratios to q decide the gains.
+    since the gains rest on
+    ratios alone, q / r and p0 / r, of which the second fades after few outputs.
 
     Attributes:
         q, decay, state: the values to choose from.

@@ -11,12 +11,13 @@ from witness import moving
 
 from lae_sim.clock import Clock
 from lae_sim.comparison import compare
-from lae_sim.costs import cost_notes, measure_cost, parse_cost, resolve_costs
+from lae_sim.costs import cost_notes, measure_cost, resolve_costs
 from lae_sim.errors import LaeError
 from lae_sim.evaluation import answers, evaluate
 from lae_sim.forecast import ConstantVelocity, Hold, Oracle
 from lae_sim.kalman import Kalman
 from lae_sim.metadata import Metadata
+from lae_sim.options import parse_cost
 from lae_sim.recording import Recording
 from lae_sim.run import replay_sequence
 from lae_sim.trace import Trace

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from witness import moving
 
-from lae_sim.camera import CameraCompensated
+from lae_sim.camera import Camera, CameraCompensated
 from lae_sim.clock import Clock
 from lae_sim.evaluation import evaluate
 from lae_sim.forecast import Hold
@@ -91,7 +91,7 @@ def test_a_part_of_the_same_video_counts_as_seen() -> None:
     metadata = Metadata.new("30", "every-frame")
     found = evaluate(runs, metadata, {"hold": Hold})
     rule = Learned(None, {"sequences": ["car1_1", "bus"]})
-    camera = CameraCompensated(Windowed(rule), {}, Fraction(30))
+    camera = CameraCompensated(Windowed(rule), Camera({}, Fraction(30)))
     forecasters = {"hold": Hold, "one": Windowed(rule), "two": camera}
     notes = notes_on(found, metadata, PYSOT, forecasters, at_arrival=False)
     assert ["trained on 1 of these 2 sequences" in note for note in notes] == [True, True]

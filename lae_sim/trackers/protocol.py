@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Optional, Protocol, Sequence, Tuple, Union
 
-import numpy as np
-
 if TYPE_CHECKING:
+    import numpy as np
     import numpy.typing as npt
 
     Array = npt.NDArray[Any]
     Image = npt.NDArray[np.uint8]
-else:  # NumPy before 1.20, which Ubuntu 20.04 and so JetPack 5 bring, has no typing
-    Array = Image = np.ndarray
+else:  # without NumPy, for quick command lines; and NumPy before 1.20 has no typing
+    Array = Image = Any
 """A frame as OpenCV has it: uint8 [H, W, 3], blue, green, red."""
 
 Box = Sequence[float]
