@@ -55,6 +55,12 @@ class TunedKalman:
         if self.state not in ("corner", "centre"):
             raise LaeError(f"a Kalman filter's state is corner or centre, not {self.state!r}")
 
+    def __str__(self) -> str:
+        """Its name on command lines."""
+        return f"kalman:q={self.q:g},decay={self.decay:g},state={self.state}" + (
+            "" if (self.r, self.p0) == (10, 100) else f",r={self.r:g},p0={self.p0:g}"
+        )
+
     def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Kalman:
         """The filter of one sequence."""
         return Kalman(box, image_size, self)
