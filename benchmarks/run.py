@@ -202,7 +202,7 @@ def forecaster_lines(rounds: int) -> list[list[str]]:
     if importlib.util.find_spec("torch"):
         examples = Examples(
             ("s",),
-            lanes.part(0, 1),
+            lanes.chosen(np.arange(many) == 0, np.arange(0))[0],
             np.arange(count),
             frames[1 : count + 1],
             *(boxes[1 : count + 1] for _ in range(2)),

@@ -220,15 +220,14 @@ def _answers(
     )
     if not isinstance(factory, SequenceFactory):
         return fed, found, forecast(factory, lanes, found.item, found.frame, name)
-    parts = []
-    for s, run in enumerate(runs):
-        first, last = np.searchsorted(fed.sequence, [s, s + 1])
-        low, high = np.searchsorted(found.item, fed.offsets[[first, last]])
-        item, frame = found.item[low:high] - fed.offsets[first], found.frame[low:high]
-        with explained(name):
-            own_factory = factory.for_sequence(run.recording)
-        parts.append(forecast(own_factory, lanes.part(first, last), item, frame, name))
-    return fed, found, np.concatenate(parts)
+    with explained(name):
+        factories = [factory.for_sequence(run.recording) for run in runs]
+    answered = np.empty((len(found.item), 4))
+    for each in {id(its): its for its in factories}.values():  # at once where several share one
+        theirs = np.array([its is each for its in factories])[fed.sequence]
+        part, asked, item = lanes.chosen(theirs, found.item)
+        answered[asked] = forecast(each, part, item, found.frame[asked], name)
+    return fed, found, answered
 
 
 class _Scorer:

@@ -91,19 +91,11 @@ class Examples:
     def without(self, sequences: Collection[str]) -> Examples:
         """All but some sequences: neither their outputs nor their truth is left."""
         kept = np.array([name not in sequences for name in self.sequences])
-        sizes = np.diff(self.lanes.offsets)
-        kept_items = np.repeat(kept, sizes)
-        lanes = Lanes(
-            np.concatenate([[0], np.cumsum(sizes[kept])]),
-            self.lanes.frames[kept_items],
-            self.lanes.boxes[kept_items],
-            self.lanes.image_sizes[kept],
-        )
-        asked = kept_items[self.item]
+        lanes, asked, item = self.lanes.chosen(kept, self.item)
         return Examples(
             tuple(name for name, its in zip(self.sequences, kept) if its),
             lanes,
-            (np.cumsum(kept_items) - 1)[self.item[asked]],
+            item,
             *(getattr(self, name)[asked] for name in ("frame", "truth", "boxes")),
         )
 

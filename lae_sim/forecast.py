@@ -20,7 +20,7 @@ from typing import Any, Optional, Protocol, runtime_checkable
 
 import numpy as np
 
-from lae_sim.boxes import Floats
+from lae_sim.boxes import Bools, Floats
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError, explained
 
@@ -69,15 +69,22 @@ class Lanes:
         first: Ints = self.offsets[self.lane(item)]
         return first
 
-    def part(self, begin: int, end: int) -> Lanes:
-        """Some consecutive lanes, whose items then count from 0."""
-        items = slice(self.offsets[begin], self.offsets[end])
-        return Lanes(
-            self.offsets[begin : end + 1] - self.offsets[begin],
-            self.frames[items],
-            self.boxes[items],
-            self.image_sizes[begin:end],
+    def chosen(self, lanes: Bools, item: Ints) -> tuple[Lanes, Bools, Ints]:
+        """Some of the lanes, by a mark for each: bool [lanes].
+
+        Returns:
+            The lanes, which of some items [P] are theirs, bool [P], and those items' places there.
+        """
+        sizes = np.diff(self.offsets)
+        kept = np.repeat(lanes, sizes)
+        part = Lanes(
+            np.concatenate([[0], np.cumsum(sizes[lanes])]),
+            self.frames[kept],
+            self.boxes[kept],
+            self.image_sizes[lanes],
         )
+        theirs = kept[item]
+        return part, theirs, (np.cumsum(kept) - 1)[item[theirs]]
 
 
 @runtime_checkable

@@ -201,7 +201,7 @@ def test_no_state_leaks_from_one_sequence_to_another(
     def alone(k: int) -> Told:
         fresh = request.getfixturevalue("learned") if name == "learned" else load_forecaster(name)
         factory = factory_for(fresh, sequences[k])
-        part = lanes.part(k, k + 1)
+        part = lanes.chosen(np.arange(count) == k, item)[0]
         return told([factory(part.boxes[0].tolist(), (640, 360))], part)[0]
 
     factories = [factory_for(found, sequence) for sequence in sequences]
@@ -211,12 +211,15 @@ def test_no_state_leaks_from_one_sequence_to_another(
     assert told(made, lanes) == expected  # by turns
     k = data.draw(st.integers(0, count - 1))
     again = factories[k](firsts[k], (640, 360))
-    assert told([again], lanes.part(k, k + 1)) == [expected[k]]  # after the others
+    assert told([again], lanes.chosen(np.arange(count) == k, item)[0]) == [
+        expected[k]
+    ]  # after the others
     if name != "oracle":
         both = [forecast(found, lanes, item, frame), streaming(found, lanes, item, frame)]
         order = np.flatnonzero(lanes.lane(item) == k)
-        part = item[order] - lanes.offsets[k]
-        one = forecast(found, lanes.part(k, k + 1), part, frame[order])
+        part, asked, places = lanes.chosen(np.arange(count) == k, item)
+        assert np.flatnonzero(asked).tolist() == order.tolist()
+        one = forecast(found, part, places, frame[order])
         tolerance = 1e-3 if name == "learned" else 1e-9
         for answers in both:
             np.testing.assert_allclose(answers[order], one, rtol=1e-9, atol=tolerance)
