@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lae_sim.boxes import Floats
+from lae_sim.boxes import Floats, centre
 from lae_sim.engine import Ints
 from lae_sim.forecast import Forecaster, ForecasterFactory, ImageSize, Lanes, forecast
 
@@ -67,5 +67,5 @@ class _Several:
 
 def _distance(a: Floats, b: Floats) -> Floats:
     """Distance of centres, float64 [n]."""
-    apart = a[:, :2] + a[:, 2:] / 2 - b[:, :2] - b[:, 2:] / 2
+    apart = centre(a) - centre(b)
     return np.hypot(apart[:, 0], apart[:, 1])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.clock import parse_rational
 from lae_sim.errors import LaeError
-from lae_sim.files import check_distinct, labels
+from lae_sim.files import check_distinct, check_folders, labels
 from lae_sim.options import add_forecasting, add_worlds, parse_policy, whole
 from lae_sim.zoo import FORECASTERS, find_camera, load_any
 
@@ -98,21 +98,21 @@ def _compare(arguments: argparse.Namespace) -> None:
     table = _table(arguments, traces, forecasters)
     if arguments.out:
         _write(table, arguments.out)
-    attributes = {
-        (trace.metadata.dataset, name): trace.metadata.attributes(name)
-        for trace in traces.values()
-        for name in table.loc[table["dataset"] == trace.metadata.dataset, "sequence"].unique()
-    }
-    _tell(arguments, table, attributes if arguments.attributes else None)
+    attributes = None
+    if arguments.attributes:
+        attributes = {
+            (trace.metadata.dataset, name): trace.metadata.attributes(name)
+            for trace in traces.values()
+            for name in table.loc[table["dataset"] == trace.metadata.dataset, "sequence"].unique()
+        }
+    _tell(arguments, table, attributes)
 
 
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse what would only fail after the work."""
     outputs = [path for path in (arguments.out, arguments.plot) if path]
     check_distinct(outputs, arguments.traces)
-    for path in outputs:
-        if not Path(path).resolve().parent.is_dir():
-            raise LaeError(f"cannot write {path}: its folder is not there")
+    check_folders(outputs)
     if arguments.out and Path(arguments.out).suffix not in (".csv", ".parquet"):
         raise LaeError(f"--out {arguments.out}: name a .csv or .parquet file")
     if arguments.plot:

@@ -1,4 +1,4 @@
-"""Pictures of a comparison (extra ``plot``), from what :mod:`lae_sim.statistics` computed."""
+"""Pictures of a comparison, from what :mod:`lae_sim.statistics` computed."""
 
 from __future__ import annotations
 

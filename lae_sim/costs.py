@@ -63,8 +63,7 @@ def resolve_costs(
             raise LaeError(f"the cost {text!r}: there is no forecaster {name!r} here")
         names = [name] if name else [each for each in forecasters if each != "hold"]
         costs.update(dict.fromkeys(names, parse_cost(cost)))
-    recording = next(iter(trace))
     return {
-        name: measure_cost(forecasters[name], recording, name) if cost is None else cost
+        name: measure_cost(forecasters[name], next(iter(trace)), name) if cost is None else cost
         for name, cost in costs.items()
     }

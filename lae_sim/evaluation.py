@@ -196,6 +196,20 @@ def answers(
     return Answers(pairing.frames[fed.output[found.item]], boxes)
 
 
+def lanes_of(runs: Sequence[Run], pairing: Pairing, fed: Histories, image_sizes: Floats) -> Lanes:
+    """What forecasters are fed in some histories of some runs.
+
+    Args:
+        runs: those that were paired.
+        pairing: of their schedules.
+        fed: histories of the pairing.
+        image_sizes: of each run, float64 [S, 2], infinite = unknown.
+    """
+    boxes = np.concatenate([run.boxes for run in runs])
+    frames = pairing.frames[fed.output]
+    return Lanes(fed.offsets, frames, boxes[fed.output], image_sizes[fed.sequence])
+
+
 def _answers(
     runs: Sequence[Run],
     metadata: Metadata,
@@ -210,14 +224,8 @@ def _answers(
         )
     fed = histories(pairing, memoryless=own(factory, "memoryless"))
     found = pairs(pairing, fed)
-    boxes = np.concatenate([run.boxes for run in runs])
     sizes = [metadata.image_size(run.recording.name) or (np.inf, np.inf) for run in runs]
-    lanes = Lanes(
-        fed.offsets,
-        pairing.frames[fed.output],
-        boxes[fed.output],
-        np.array(sizes, np.float64)[fed.sequence],
-    )
+    lanes = lanes_of(runs, pairing, fed, np.array(sizes, np.float64))
     if not isinstance(factory, SequenceFactory):
         return fed, found, forecast(factory, lanes, found.item, found.frame, name)
     with explained(name):

@@ -14,6 +14,7 @@ import numpy as np
 from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError
+from lae_sim.evaluation import lanes_of
 from lae_sim.forecast import AnyFactory, ForecasterFactory, Lanes, Sequenced, factory_for, own_notes
 from lae_sim.pairing import histories, pair, pairs
 from lae_sim.run import Run
@@ -48,13 +49,7 @@ class Examples:
         pairing = pair([run.schedule for run in runs], [Fraction(0)])
         fed = histories(pairing)
         found = pairs(pairing, fed)
-        output_boxes = np.concatenate([run.boxes for run in runs])
-        lanes = Lanes(
-            fed.offsets,
-            pairing.frames[fed.output],
-            output_boxes[fed.output],
-            np.full((len(runs), 2), np.inf),
-        )
+        lanes = lanes_of(runs, pairing, fed, np.full((len(runs), 2), np.inf))
         ends = np.cumsum(pairing.lengths)
         row = (ends - pairing.lengths)[lanes.lane(found.item)] + found.frame
         return cls(

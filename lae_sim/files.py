@@ -78,3 +78,14 @@ def labels(paths: Sequence[str]) -> list[str]:
     """File names, where they tell the files apart; otherwise the paths."""
     names = [Path(path).name for path in paths]
     return names if len(set(names)) == len(names) else list(paths)
+
+
+def check_folders(paths: Iterable[str]) -> None:
+    """Refuse, before work that may take long, files whose folder is not there.
+
+    Raises:
+        LaeError: if a folder is missing.
+    """
+    for path in paths:
+        if not Path(path).resolve().parent.is_dir():
+            raise LaeError(f"cannot write {path}: its folder is not there")

@@ -65,9 +65,11 @@ class TunedKalman:
         """The filter of one sequence."""
         return Kalman(box, image_size, self)
 
-    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
-        """The same for many lanes at once."""
-        position, velocity = filter_lanes(lanes, self)
+    def forecast_lanes(
+        self, lanes: Lanes, item: Ints, frame: Ints, restart_iou: float | None = None
+    ) -> Floats:
+        """The same for many lanes at once; restarts as in :func:`filter_lanes`."""
+        position, velocity = filter_lanes(lanes, self, restart_iou)
         reach = self.reach((frame - lanes.frames[item]).astype(np.float64))
         return self.boxes(position[item] + reach[:, None] * velocity[item])
 
@@ -205,9 +207,7 @@ class KalmanLaePvt(Kalman):
     @staticmethod
     def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
         """The same for many lanes at once; equal bit for bit."""
-        position, velocity = filter_lanes(lanes, PAPER, restart_iou=RESTART_IOU)
-        ahead = (frame - lanes.frames[item]).astype(np.float64)
-        forecasts = position[item] + ahead[:, None] * velocity[item]
+        forecasts = PAPER.forecast_lanes(lanes, item, frame, RESTART_IOU)
         return clip(forecasts, lanes.boxes[item], lanes.image_sizes[lanes.lane(item)])
 
 

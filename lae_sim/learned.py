@@ -180,10 +180,15 @@ def new_network() -> Any:
     return network
 
 
+def sides_and_size(boxes: Floats) -> tuple[Floats, Floats]:
+    """Width and height, at least 1 px, [..., 2], and their geometric mean, [..., 1]."""
+    sides = np.maximum(boxes[..., 2:], 1.0)
+    return sides, np.sqrt(sides[..., :1] * sides[..., 1:])
+
+
 def _moved(boxes: Floats, change: Floats) -> Floats:
     """Boxes moved and resized by a change of centre (target sizes) and log sides."""
-    sides = np.maximum(boxes[:, 2:], 1.0)
-    scale = np.sqrt(sides[:, :1] * sides[:, 1:])
+    _, scale = sides_and_size(boxes)
     centre = boxes[:, :2] + boxes[:, 2:] / 2 + change[:, :2] * scale
     new = boxes[:, 2:] * np.exp(np.clip(change[:, 2:], -1.0, 1.0))
     return np.concatenate([centre - new / 2, new], axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -18,10 +18,7 @@ if TYPE_CHECKING:
 
 def add_world(parser: argparse.ArgumentParser) -> None:
     """Add what decides a replay: the frame rate, the policy and the processing times."""
-    world = parser.add_argument_group("the world and the tracker")
-    add = world.add_argument
-    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
-    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
+    add = _world_group(parser)
     add(
         "--latency", default="recorded", help="where processing times come from (default: recorded)"
     )
@@ -50,10 +47,7 @@ def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> N
         parser: the command line.
         scales: exact factors on all times, by default.
     """
-    world = parser.add_argument_group("the world and the tracker")
-    add = world.add_argument
-    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
-    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
+    add = _world_group(parser)
     add(
         "--latency",
         nargs="+",
@@ -70,6 +64,14 @@ def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> N
         help="exact factors on all times, one after another "
         f"(default: {' '.join(map(str, scales))})",
     )
+
+
+def _world_group(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
+    """A group of options that begins with the world's rate and the policy; what adds to it."""
+    add = parser.add_argument_group("the world and the tracker").add_argument
+    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
+    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
+    return add
 
 
 def parse_cost(text: str) -> int | None:

@@ -210,7 +210,7 @@ class _Job:
             runs=lambda: replay_trace(trace, fps, source, policy, timing, strided),
             at_arrival=at_arrival,
             forecasters=forecasters,
-            costs=resolve_costs(arguments.cost, forecasters, trace) if arguments.cost else {},
+            costs=resolve_costs(arguments.cost, forecasters, trace),
             sigmas=sigmas,
             convention=find_convention(arguments.convention),
         )

@@ -7,11 +7,10 @@ import sys
 from collections.abc import Sequence
 from fractions import Fraction
 from functools import partial
-from pathlib import Path
 
 from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.errors import LaeError
-from lae_sim.files import check_distinct
+from lae_sim.files import check_distinct, check_folders
 from lae_sim.options import add_worlds, whole
 
 PROGRAM = "lae-sim train"
@@ -71,8 +70,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from lae_sim.training import NetworkTrainer
 
     check_distinct([arguments.out], arguments.traces)
-    if not Path(arguments.out).resolve().parent.is_dir():  # training may take long
-        raise LaeError(f"cannot write {arguments.out}: its folder is not there")
+    check_folders([arguments.out])
     world = parse_world(arguments)
     traces = [read_trace(path, arguments.sequence) for path in arguments.traces]
     examples = Examples.joined(

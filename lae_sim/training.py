@@ -14,7 +14,7 @@ from lae_sim.errors import LaeError
 from lae_sim.examples import Examples
 from lae_sim.forecast import ForecasterFactory
 from lae_sim.kalman import PAPER
-from lae_sim.learned import Inputs, Learned, import_torch, new_network, one_thread
+from lae_sim.learned import Inputs, Learned, import_torch, new_network, one_thread, sides_and_size
 from lae_sim.window import Window, Windowed
 
 
@@ -111,8 +111,7 @@ def _goals(latest: Floats, examples: Examples, which: Ints) -> Any:
     truth = np.where(_sized(truth)[:, None], truth, own)
     own = np.where(_sized(own)[:, None], own, truth)
     goals = np.stack([truth, own], axis=1)
-    sides = np.maximum(latest[:, None, 2:], 1.0)
-    scale = np.sqrt(sides[..., :1] * sides[..., 1:])
+    sides, scale = sides_and_size(latest[:, None])
     centre = goals[..., :2] + goals[..., 2:] / 2 - latest[:, None, :2] - latest[:, None, 2:] / 2
     logs = np.log(goals[..., 2:] / sides)
     aspect = np.broadcast_to(np.log(sides / scale), logs.shape)
