@@ -7,24 +7,25 @@ summation changes a result.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lae_sim.boxes import Floats
+from lae_sim.boxes import Bools, Floats
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError, explained
 from lae_sim.forecast import AnyFactory, Lanes, SequenceFactory, forecast, own
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import (
+    CENTRE_THRESHOLDS,
     METRICS,
     NORM_THRESHOLDS,
     PYSOT,
     Convention,
-    FrameCounts,
     frame_counts,
 )
 from lae_sim.pairing import Histories, Pairing, Pairs, histories, pair, pairs
@@ -50,8 +51,14 @@ class Evaluation:
         mismatch_sum, mismatch_max: of i - psi(i), frames, int64 [S, M].
         longest_hold: most queries in a row with one answering output, frames, int64 [S, M].
         scores: per metric of ``METRICS``, float64 [F, S, M] in 0..1; NaN = leaves the mean.
+        failure: the first world frame whose answer does not overlap the truth at all, int64
+            [F, S, M]; the number of world frames if there is none.
+        success: over the convention's IoU thresholds at the first sigma, float64 [F, S, N]; NaN as
+            in the scores.
+        precision: over 0, 1, ..., 50 px at the first sigma, float64 [F, S, 51].
         offline: per metric, of the trace's boxes at their own frames, float64 [S]; NaN where the
             trace does not hold every frame.
+        offline_success, offline_precision: their curves, float64 [S, N] and [S, 51].
     """
 
     sequences: tuple[str, ...]
@@ -68,13 +75,21 @@ class Evaluation:
     mismatch_max: Ints
     longest_hold: Ints
     scores: Mapping[str, Floats]
+    failure: Ints
+    success: Floats
+    precision: Floats
     offline: Mapping[str, Floats]
+    offline_success: Floats
+    offline_precision: Floats
 
     @classmethod
     def joined(cls, parts: Sequence[Evaluation]) -> Evaluation:
         """The evaluations of some groups of sequences as one."""
+        by_forecaster = ("failure", "success", "precision")
         columns = {
-            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            field.name: np.concatenate(
+                [getattr(part, field.name) for part in parts], axis=int(field.name in by_forecaster)
+            )
             for field in fields(cls)
             if field.name not in ("sequences", "scores", "offline")
         }
@@ -109,15 +124,30 @@ def evaluate(
     Raises:
         LaeError: if there is no run or no forecaster, or whatever iterating over the runs raises.
     """
-    if not forecasters:
-        raise LaeError("name at least one forecaster, such as hold")
-    parts = [
-        _evaluate_group(group, metadata, forecasters, sigmas, convention, at_arrival, costs or {})
-        for group in batched(runs)
-    ]
+    parts = list(
+        evaluate_groups(runs, metadata, forecasters, sigmas, convention, at_arrival, costs)
+    )
     if not parts:
         raise LaeError("there is nothing to evaluate: no sequences")
     return Evaluation.joined(parts)
+
+
+def evaluate_groups(
+    runs: Iterable[Run],
+    metadata: Metadata,
+    forecasters: Mapping[str, AnyFactory],
+    sigmas: Sequence[Fraction] = (Fraction(0),),
+    convention: Convention = PYSOT,
+    at_arrival: bool = False,
+    costs: Mapping[str, int] | None = None,
+) -> Iterator[Evaluation]:
+    """The same, group after group of sequences, for those who keep less than all of it."""
+    if not forecasters:
+        raise LaeError("name at least one forecaster, such as hold")
+    for group in batched(runs):
+        yield _evaluate_group(
+            group, metadata, forecasters, sigmas, convention, at_arrival, costs or {}
+        )
 
 
 def _evaluate_group(
@@ -135,12 +165,11 @@ def _evaluate_group(
     pairings = {cost: pair(schedules, sigmas, at_arrival, cost) for cost in needed}
     pairing = pairings[0]
     scorer = _Scorer(runs, convention)
-    per_forecaster = [
-        scorer.scores_of(
-            *_answers(runs, metadata, pairings[costs.get(name, 0)], name, factory), len(sigmas)
-        )
+    scored = [
+        scorer.of(*_answers(runs, metadata, pairings[costs.get(name, 0)], name, factory), sigmas)
         for name, factory in forecasters.items()
     ]
+    offline = scorer.offline()
     calls = [run.schedule.elapsed_ns[1:] for run in runs]
     return Evaluation(
         sequences=tuple(run.recording.name for run in runs),
@@ -156,8 +185,13 @@ def _evaluate_group(
         mismatch_sum=pairing.mismatch_sum,
         mismatch_max=pairing.mismatch_max,
         longest_hold=pairing.longest_hold,
-        scores={m: np.stack([scores[m] for scores in per_forecaster]) for m in METRICS},
-        offline=scorer.offline(),
+        scores={m: np.stack([each.scores[m] for each in scored]) for m in METRICS},
+        failure=np.stack([each.failure for each in scored]),
+        success=np.stack([each.success for each in scored]),
+        precision=np.stack([each.precision for each in scored]),
+        offline={metric: share[:, 0] for metric, share in offline.scores.items()},
+        offline_success=offline.success,
+        offline_precision=offline.precision,
     )
 
 
@@ -238,62 +272,103 @@ def _answers(
     return fed, found, answered
 
 
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """The scores of one forecaster; see :class:`Evaluation`, without the first axis."""
+
+    scores: Mapping[str, Floats]
+    failure: Ints
+    success: Floats
+    precision: Floats
+
+
 class _Scorer:
     """Scores answers of some runs against their truth."""
 
     def __init__(self, runs: Sequence[Run], convention: Convention) -> None:
         self._convention = convention
-        lengths = np.array([len(run.recording) for run in runs], np.int64)
-        self._bases = np.cumsum(lengths) - lengths
+        self._lengths = np.array([len(run.recording) for run in runs], np.int64)
+        self._bases = np.cumsum(self._lengths) - self._lengths
         self._truth = np.concatenate([run.recording.truth for run in runs])
         self._boxes = np.concatenate([run.recording.boxes for run in runs])
-        self._sequence = np.repeat(np.arange(len(runs)), lengths)
-        self._success_frames = self._success_base = lengths
+        counted = self._lengths
         if convention.leaves_out:
             valid = convention.valid_success(self._truth)
-            self._success_frames = np.add.reduceat(valid.astype(np.int64), self._bases)
+            counted = np.add.reduceat(valid.astype(np.int64), self._bases)
+        self._counted = np.where(counted > 0, counted, np.nan)
 
-    def scores_of(
-        self, fed: Histories, found: Pairs, boxes: Floats, count: int
-    ) -> dict[str, Floats]:
-        """Per metric, float64 [S, count], of paired answers."""
+    def of(
+        self, fed: Histories, found: Pairs, boxes: Floats, sigmas: Sequence[Fraction]
+    ) -> _Scored:
+        """Score paired answers."""
         history = np.searchsorted(fed.offsets, found.item, "right") - 1
-        sequence = fed.sequence[history]
+        return self._scored(fed.sequence[history], found, boxes, len(sigmas))
+
+    def offline(self) -> _Scored:
+        """Score every frame's own box; NaN for sequences that lack some."""
+        sequence = np.repeat(np.arange(len(self._bases)), self._lengths)
+        frame = np.arange(len(self._truth)) - self._bases[sequence]
+        none = np.zeros_like(frame)
+        scored = self._scored(sequence, Pairs(frame, frame, none, none + 1), self._boxes, 1)
+        missing = np.add.reduceat(np.isnan(self._boxes[:, 0]).astype(np.int64), self._bases) > 0
+        for values in (*scored.scores.values(), scored.success, scored.precision):
+            values[missing] = np.nan
+        return scored
+
+    def _scored(self, sequence: Ints, found: Pairs, boxes: Floats, count: int) -> _Scored:
         truth = self._truth[self._bases[sequence] + found.frame]
         counts = frame_counts(truth, boxes, found.frame, self._convention)
         width = count + 1
         begin, end = sequence * width + found.sigma_from, sequence * width + found.sigma_to
 
-        def summed(values: Ints) -> Ints:
+        def summed(values: npt.NDArray[Any]) -> Ints:
             size = len(self._bases) * width
             steps = np.bincount(begin, values, size) - np.bincount(end, values, size)
             return steps.reshape(-1, width).cumsum(axis=1)[:, :count].astype(np.int64)
 
-        return self._shares(FrameCounts(*(summed(column) for column in _columns(counts))))
-
-    def offline(self) -> dict[str, Floats]:
-        """Per metric, float64 [S], of every frame's own box."""
-        frame = np.arange(len(self._truth)) - self._bases[self._sequence]
-        counts = frame_counts(self._truth, self._boxes, frame, self._convention)
-        missing = np.add.reduceat(np.isnan(self._boxes[:, 0]).astype(np.int64), self._bases) > 0
-        sums = (np.add.reduceat(column, self._bases)[:, None] for column in _columns(counts))
-        shares = self._shares(FrameCounts(*sums))
-        return {name: np.where(missing, np.nan, share[:, 0]) for name, share in shares.items()}
-
-    def _shares(self, sums: FrameCounts) -> dict[str, Floats]:
-        """Sums of counts [S, M] as shares; NaN where a sequence leaves the mean."""
-        frames = np.where(self._success_frames > 0, self._success_frames, np.nan)[:, None]
-        shares = {
-            "auc": sums.success / (frames * self._convention.thresholds),
-            "dp20": sums.dp / frames,
-            "norm_dp20": sums.norm_dp / frames,
-            "norm_auc": sums.norm / (frames * len(NORM_THRESHOLDS)),
+        sums = {
+            "auc": summed(counts.success),
+            "dp20": summed(counts.dp),
+            "norm_dp20": summed(counts.norm_dp),
+            "norm_auc": summed(counts.norm),
         }
+        thresholds = {"auc": self._convention.thresholds, "norm_auc": len(NORM_THRESHOLDS)}
+        counted = self._counted[:, None]
+        scores = {m: sums[m] / (counted * thresholds.get(m, 1)) for m in METRICS}
+        at_first = found.sigma_from == 0
+        success, precision = (
+            _shares_above(sequence[at_first], passed[at_first], most, len(self._bases)) / counted
+            for passed, most in (
+                (counts.success, self._convention.thresholds),
+                (counts.precision, len(CENTRE_THRESHOLDS)),
+            )
+        )
         if self._convention.drops_zeros:
-            for name, best in zip(METRICS, (sums.success, sums.within50, sums.norm, sums.norm)):
-                shares[name] = np.where(best > 0, shares[name], np.nan)
-        return shares
+            bests = (sums["auc"], summed(counts.within50), sums["norm_auc"], sums["norm_auc"])
+            for metric, best in zip(METRICS, bests):
+                scores[metric] = np.where(best > 0, scores[metric], np.nan)
+            success[np.isnan(scores["auc"][:, 0])] = np.nan
+            precision[np.isnan(scores["dp20"][:, 0])] = np.nan
+        failure = self._failure(sequence, found, counts.apart, count)
+        return _Scored(scores, failure, success, precision[:, ::-1])
+
+    def _failure(self, sequence: Ints, found: Pairs, apart: Bools, count: int) -> Ints:
+        """The first frame of each sequence whose answer is apart from the truth, int64 [S, M]."""
+        failure = np.repeat(self._lengths[:, None], count, axis=1)
+        lost = np.flatnonzero(apart)
+        sequence, frame = sequence[lost], found.frame[lost]
+        begin, end = found.sigma_from[lost], found.sigma_to[lost]
+        for m in range(count):
+            of_m = np.flatnonzero((begin <= m) & (m < end))  # their frames ascend in each sequence
+            those = sequence[of_m]
+            first = np.flatnonzero(np.diff(those, prepend=-1))
+            failure[those[first], m] = frame[of_m[first]]
+        return failure
 
 
-def _columns(counts: FrameCounts) -> list[npt.NDArray[np.int64]]:
-    return [getattr(counts, field.name) for field in fields(counts)]
+def _shares_above(sequence: Ints, passed: Ints, most: int, sequences: int) -> Floats:
+    """How many frames passed more than 0, 1, ..., ``most`` - 1 thresholds, float64 [S, most]."""
+    width = most + 1
+    counts = np.bincount(sequence * width + passed, minlength=sequences * width)
+    above = counts.reshape(-1, width)[:, :0:-1].cumsum(axis=1)[:, ::-1]
+    return above.astype(np.float64)

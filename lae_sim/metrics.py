@@ -97,7 +97,7 @@ def find_convention(name: str) -> Convention:
 
 
 METRICS = ("auc", "dp20", "norm_dp20", "norm_auc")
-"""What :func:`frame_counts` counts, in order, before ``within50``: see :class:`FrameCounts`."""
+"""The scores of a sequence."""
 
 
 @dataclass(frozen=True)
@@ -106,17 +106,29 @@ class FrameCounts:
 
     Attributes:
         success: IoU thresholds passed, int64 [n].
-        dp: 1 if the centre error is <= 20 px, int64 [n].
-        norm_dp: 1 if the normalised error is <= 0.20, int64 [n].
+        precision: centre error thresholds passed, of 0..50 px, int64 [n].
+        norm_dp: whether the normalised error is <= 0.20, bool [n].
         norm: normalised thresholds passed, int64 [n].
-        within50: 1 if the centre error is <= 50 px, int64 [n].
+        apart: whether the truth counts for success and the answer does not overlap it at all, bool
+            [n]: a failure, as VOT has it (Kristan et al., 2013).
     """
 
     success: Ints
-    dp: Ints
-    norm_dp: Ints
+    precision: Ints
+    norm_dp: Bools
     norm: Ints
-    within50: Ints
+    apart: Bools
+
+    @property
+    def dp(self) -> Bools:
+        """Whether the centre error is <= 20 px, bool [n]."""
+        within: Bools = self.precision > CENTRE_THRESHOLDS[-1] - DP_PIXELS
+        return within
+
+    @property
+    def within50(self) -> Bools:
+        """Whether the centre error is <= 50 px, bool [n]."""
+        return self.precision > 0
 
 
 def frame_counts(
@@ -143,12 +155,14 @@ def frame_counts(
     with np.errstate(over="ignore"):  # a truth of almost no size: an infinite error is a miss
         norm_error = np.where(valid_centre, _length(offset / sized), invalid_error)
     norm_error = np.where(np.isnan(norm_error), np.inf, norm_error)
+    most = len(CENTRE_THRESHOLDS)
+    whole = np.ceil(np.fmin(np.maximum(error, 0), most))  # fmin: an error of NaN passes none
     return FrameCounts(
         success=success,
-        dp=(error <= DP_PIXELS).astype(np.int64),
-        norm_dp=(norm_error <= NORM_DP).astype(np.int64),
+        precision=most - whole.astype(np.int64),
+        norm_dp=norm_error <= NORM_DP,
         norm=len(NORM_THRESHOLDS) - np.searchsorted(NORM_THRESHOLDS, norm_error),
-        within50=(error <= CENTRE_THRESHOLDS[-1]).astype(np.int64),
+        apart=overlap == 0,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,11 +11,11 @@ import numpy as np
 
 from lae_sim.boxes import Floats
 from lae_sim.errors import LaeError
-from lae_sim.evaluation import answers
+from lae_sim.evaluation import evaluate
 from lae_sim.files import written_whole
 from lae_sim.forecast import AnyFactory
 from lae_sim.metadata import Metadata
-from lae_sim.metrics import CENTRE_THRESHOLDS, PYSOT, Convention, precision_curve, success_curve
+from lae_sim.metrics import CENTRE_THRESHOLDS, PYSOT, Convention
 from lae_sim.pairing import pair
 from lae_sim.run import Run
 
@@ -37,37 +37,19 @@ def curves(
     costs: Mapping[str, int] | None = None,
 ) -> Curves:
     """Curves of the offline boxes, where the trace holds every frame, and of each forecaster."""
-    successes: dict[str, list[Floats]] = {}
-    precisions: dict[str, list[Floats]] = {}
-    every_frame = True
-    for run in runs:
-        truth = run.recording.truth
-        boxes = {"offline": run.recording.boxes}
-        for name, factory in forecasters.items():
-            cost_ns = (costs or {}).get(name, 0)
-            found = answers(run, metadata, name, factory, sigma, at_arrival, cost_ns)
-            boxes[name] = found.boxes
-        every_frame = every_frame and not np.isnan(run.recording.boxes).any()
-        for name, answered in boxes.items():
-            success = success_curve(truth, answered, convention)
-            precision = precision_curve(truth, answered, convention)
-            successes.setdefault(name, []).append(success)
-            precisions.setdefault(name, []).append(precision)
+    found = evaluate(runs, metadata, forecasters, [sigma], convention, at_arrival, costs)
+    named = dict(zip(forecasters, zip(found.success, found.precision)))
+    if not found.missing.any():
+        named = {"offline": (found.offline_success, found.offline_precision), **named}
     return {
-        name: (_mean(successes[name], convention), _mean(precisions[name], convention))
-        for name in successes
-        if name != "offline" or every_frame
+        name: (_mean(success), _mean(precision)) for name, (success, precision) in named.items()
     }
 
 
-def _mean(curves: Sequence[Floats], convention: Convention) -> Floats:
+def _mean(curves: Floats) -> Floats:
     """Mean of the sequences that the convention counts; NaN if there is none."""
-    kept = [
-        curve
-        for curve in curves
-        if not np.isnan(curve).any() and (curve.any() or not convention.drops_zeros)
-    ]
-    mean: Floats = np.mean(kept, axis=0) if kept else np.full_like(curves[0], np.nan)
+    kept = curves[~np.isnan(curves).any(axis=1)]
+    mean: Floats = kept.mean(axis=0) if len(kept) else np.full(curves.shape[1], np.nan)
     return mean
 
 

@@ -23,6 +23,7 @@ from witness import (
     worlds,
 )
 
+from lae_sim.boxes import iou
 from lae_sim.clock import Clock
 from lae_sim.errors import LaeError
 from lae_sim.evaluation import Evaluation, answers, evaluate
@@ -30,7 +31,7 @@ from lae_sim.forecast import ConstantVelocity, Hold
 from lae_sim.kalman import Kalman, KalmanLaePvt
 from lae_sim.latency import constant
 from lae_sim.metadata import Metadata
-from lae_sim.metrics import CONVENTIONS, METRICS
+from lae_sim.metrics import CONVENTIONS, METRICS, precision_curve, success_curve
 from lae_sim.pairing import SIGMA_GRID
 from lae_sim.policies import vot_realtime
 from lae_sim.recording import Recording
@@ -96,6 +97,37 @@ def test_scores_agree_with_plain_loops_over_the_oracle(
                     value = math.nan if value is None else float(value)
                     score = found.scores[metric][f, s, m]
                     assert score == pytest.approx(value, abs=1e-12, nan_ok=True)
+
+
+@given(groups(), SIGMAS, st.sampled_from(list(CONVENTIONS)))
+@settings(max_examples=45)
+def test_curves_and_failures_agree_with_those_of_single_sequences(
+    group: tuple[Fraction, list[Recording]], sigmas: list[Fraction], name: str
+) -> None:
+    fps, recordings = group
+    convention = CONVENTIONS[name]
+    runs = [replay_sequence(recording, Clock.at(fps)) for recording in recordings]
+    found = evaluate(runs, EVERY, FORECASTERS, sigmas, convention)
+    for s, run in enumerate(runs):
+        truth = run.recording.truth
+        valid = convention.valid_success(truth)
+        for f, (forecaster, factory) in enumerate(FORECASTERS.items()):
+            for m, sigma in enumerate(sigmas):
+                boxes = answers(run, EVERY, forecaster, factory, sigma).boxes
+                if convention.first_frame_is_truth:
+                    boxes[0] = truth[0]
+                overlaps = (iou(truth[i : i + 1], boxes[i : i + 1])[0] for i in range(len(run)))
+                apart = [i for i, overlap in enumerate(overlaps) if valid[i] and overlap == 0]
+                assert found.failure[f, s, m] == min(apart, default=len(run))
+            boxes = answers(run, EVERY, forecaster, factory, sigmas[0]).boxes
+            for curves, curve, metric in (
+                (found.success, success_curve, "auc"),
+                (found.precision, precision_curve, "dp20"),
+            ):
+                if math.isnan(found.scores[metric][f, s, 0]):
+                    assert np.isnan(curves[f, s]).all()
+                else:
+                    np.testing.assert_array_equal(curves[f, s], curve(truth, boxes, convention))
 
 
 @given(groups(), SIGMAS)
