@@ -10,7 +10,6 @@ import os
 from collections.abc import Collection, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,6 +18,7 @@ from lae_sim.arrow import checksums
 from lae_sim.checks import COLUMN_TYPES, RowChecker, check_schema
 from lae_sim.errors import LaeError, TraceError
 from lae_sim.files import written_whole
+from lae_sim.locate import is_url, opened
 from lae_sim.metadata import Metadata
 from lae_sim.recording import Recording
 from lae_sim.rows import BOX, TRUTH, Rows
@@ -51,14 +51,14 @@ def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None =
     """Open a trace; the recordings are read and checked while one iterates over them.
 
     Args:
-        path: the Parquet file.
+        path: the Parquet file, or the URL of one (``s3://…``; see :mod:`lae_sim.locate`).
         sequences: names to keep; all by default.
 
     Raises:
         TraceError: here or during iteration, if the file is not a valid trace; it names the file,
             column, sequence and frame, and the likely cause.
     """
-    stored = _StoredRecordings(Path(path), None if sequences is None else frozenset(sequences))
+    stored = _StoredRecordings(os.fspath(path), None if sequences is None else frozenset(sequences))
     metadata, rows = stored.describe()
     return Trace(metadata, replace(stored, profiled=metadata.profiled), rows)
 
@@ -135,14 +135,14 @@ def batched(items: Iterable[Item], frames: int = BATCH_ROWS) -> Iterator[list[It
 class _StoredRecordings:
     """The recordings of a file, read anew on each iteration."""
 
-    path: Path
+    path: str
     keep: frozenset[str] | None
     profiled: bool = False
 
     def describe(self) -> tuple[Metadata, int]:
         """The file's metadata and its number of rows."""
         with self._opened() as file:
-            check_schema(file.schema_arrow, str(self.path))
+            check_schema(file.schema_arrow, self.path)
             stored = (file.schema_arrow.metadata or {}).get(b"lae_sim")
             if stored is None:
                 raise TraceError(
@@ -165,7 +165,7 @@ class _StoredRecordings:
 
     def _all(self) -> Iterator[Recording]:
         """Recordings, put together again where a batch ends inside one."""
-        check = RowChecker(str(self.path), profiled=self.profiled)
+        check = RowChecker(self.path, profiled=self.profiled)
         parts: list[Recording] = []
         for rows in self._rows():
             check(rows)
@@ -195,12 +195,15 @@ class _StoredRecordings:
         import pyarrow.parquet as pq
 
         try:
-            with pq.ParquetFile(
-                self.path,
-                read_dictionary=["sequence"],
-                pre_buffer=False,
-                **checksums("page_checksum_verification"),
-            ) as file:
+            with (
+                opened(self.path) as source,
+                pq.ParquetFile(
+                    source,
+                    read_dictionary=["sequence"],
+                    pre_buffer=False,
+                    **checksums("page_checksum_verification"),
+                ) as file,
+            ):
                 yield file
         except FileNotFoundError as error:
             raise TraceError(f"{self.path}: no such file") from error
@@ -210,6 +213,10 @@ class _StoredRecordings:
             ) from error
         except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
             raise TraceError(f"{self.path}: not a readable Parquet file: {error}") from error
+        except Exception as error:
+            if isinstance(error, LaeError) or not is_url(self.path):
+                raise
+            raise TraceError(f"{self.path}: {type(error).__name__}: {error}") from error
 
 
 def _joined(parts: list[Recording]) -> Recording:

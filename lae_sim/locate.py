@@ -1,0 +1,150 @@
+"""Where traces are: files, folders, globs, and URLs of any file system that fsspec knows."""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from lae_sim.errors import LaeError, TraceError
+
+BLOCK = 1 << 20
+
+
+def find_traces(patterns: Sequence[str], base: Path | None = None) -> list[str]:
+    """The traces that patterns name: sorted within a pattern, and each file once.
+
+    Args:
+        patterns: each a file, a folder (its ``*.parquet``, not those deeper; end a web folder in
+            ``/``), a glob (``*``, ``**``, ``?``, ``[...]``), or a URL of one of these.
+        base: the folder of relative paths; by default the current one.
+
+    Raises:
+        LaeError: if a pattern matches nothing or cannot be reached.
+    """
+    found: dict[str, str] = {}
+    for pattern in patterns:
+        with _explained(pattern):
+            names = _remote(pattern) if is_url(pattern) else _local(pattern, base)
+        if not names:
+            raise LaeError(f"{pattern}: no trace is there (of a folder, *.parquet are taken)")
+        for name in sorted(names):
+            same = name.removeprefix("file://")
+            found.setdefault(same if is_url(same) else os.path.realpath(same), name)
+    return list(found.values())
+
+
+@contextmanager
+def opened(path: str) -> Iterator[Any]:
+    """What pyarrow reads a trace from: the path itself, or of a URL a file that can seek.
+
+    Raises:
+        LaeError: if a URL cannot be opened; a path is not opened here.
+    """
+    if not is_url(path):
+        yield path
+        return
+    with _explained(path):
+        file = _binary(path)
+    with file:
+        yield file
+
+
+def digest(path: str) -> str:
+    """The SHA-256 of a file's content, path or URL, in hexadecimal.
+
+    Raises:
+        LaeError: if it cannot be read.
+    """
+    whole = hashlib.sha256()
+    with _explained(path), _binary(path) if is_url(path) else open(path, "rb") as file:
+        while block := file.read(BLOCK):
+            whole.update(block)
+    return whole.hexdigest()
+
+
+def is_url(path: str) -> bool:
+    """Whether fsspec is to find it."""
+    return "://" in path
+
+
+def _local(pattern: str, base: Path | None) -> list[str]:
+    path = os.path.join(base or "", os.path.expanduser(pattern))
+    if os.path.isdir(path):
+        os.listdir(path)  # glob would find nothing, silently, where it has no permission
+        path = os.path.join(glob.escape(path), "*.parquet")
+    elif os.path.exists(path):
+        return [path]
+    return [name for name in glob.glob(path, recursive=True) if os.path.isfile(name)]
+
+
+def _remote(pattern: str) -> list[str]:
+    system, path = _file_system(pattern)
+    try:
+        kind = system.info(path)["type"]
+    except FileNotFoundError:
+        if not set("*?[") & set(path):
+            raise
+        entries = system.glob(path, detail=True).values()
+    else:
+        if kind == "file" and not pattern.endswith("/"):
+            return [pattern]
+        entries = [e for e in system.ls(path, detail=True) if e["name"].endswith(".parquet")]
+    names = [entry["name"] for entry in entries if entry["type"] == "file"]
+    names = [name for name in names if not name.rpartition("/")[2].startswith(".")]  # as in glob
+    # user, host and the like are in the URL, but not in the names
+    stem = pattern.rstrip("/")
+    before = stem.removesuffix(path.rstrip("/"))
+    return [before + name if before != stem else system.unstrip_protocol(name) for name in names]
+
+
+def _binary(url: str) -> Any:
+    system, path = _file_system(url)
+    file = system.open(path, "rb")
+    if path.startswith("http"):
+        try:
+            file.seek(-1, os.SEEK_END)
+            file.read(1)
+            file.seek(0)
+        except ValueError:  # the server sends whole files only: have it on the disk
+            file.close()
+            file = tempfile.TemporaryFile()  # noqa: SIM115 - the caller's
+            with system.open(path, "rb", block_size=0) as stream:
+                shutil.copyfileobj(stream, file, BLOCK)
+            file.seek(0)
+    return file
+
+
+def _file_system(url: str) -> tuple[Any, str]:
+    from fsspec.core import url_to_fs  # type: ignore[import-untyped]  # it has no types
+
+    system, path = url_to_fs(url)
+    system.invalidate_cache()  # a listing from before would hide that a file has changed
+    return system, path
+
+
+@contextmanager
+def _explained(path: str) -> Iterator[None]:
+    """Tell whatever goes wrong in one line: every file system has errors of its own."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        cause = error.__cause__  # refused or out of reach, of a web server
+        why = "" if cause is None else f" ({_line(cause)})"
+        raise TraceError(f"{path}: no such file{why}") from error
+    except ImportError as error:
+        missing = getattr(error.__cause__ or error, "name", None)
+        package = "'lae-sim[remote]'" if missing == "fsspec" else missing
+        raise LaeError(f"{path}: {error}: pip install {package}") from error
+    except Exception as error:
+        raise LaeError(f"{path}: cannot be read ({_line(error)})") from error
+
+
+def _line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
