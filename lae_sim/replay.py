@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 PROGRAM = "lae-sim replay"
 
+_SINGLE = ("outputs", "schedule", "events", "timeline")  # files of one trace in one world
+
 EXAMPLES = f"""\
 examples:
   lae-sim replay trace.parquet
@@ -91,6 +93,12 @@ def parser() -> argparse.ArgumentParser:
     add("--outputs", metavar="FILE", help="write every answer to a Parquet file")
     add("--schedule", metavar="FILE", help="write every processed frame's ticks to a Parquet file")
     add("--events", metavar="FILE", help="write the event log of the first sigma as JSON lines")
+    add(
+        "--timeline",
+        metavar="FILE",
+        help="write the first sigma's timeline: .json for Perfetto, or a .png, .svg or .pdf "
+        "picture of the first sequence",
+    )
     add("--export-txt", metavar="DIR", help="write result text files for the pysot toolkit")
     add("--plot", metavar="FILE", help="draw success and precision (.png, .svg, .pdf)")
     return made
@@ -108,7 +116,7 @@ def _replay(arguments: argparse.Namespace) -> None:
     from lae_sim import __version__
     from lae_sim.pairing import SIGMA_GRID
 
-    single = [name for name in ("outputs", "schedule", "events") if getattr(arguments, name)]
+    single = [name for name in _SINGLE if getattr(arguments, name)]
     if single and len(arguments.traces) > 1:
         raise LaeError(f"--{single[0]} takes one trace at a time")
     if arguments.eta is not None:
@@ -116,7 +124,7 @@ def _replay(arguments: argparse.Namespace) -> None:
     arguments.sigma = list(dict.fromkeys(arguments.sigma))
     arguments.forecaster = list(dict.fromkeys(arguments.forecaster))
     arguments.traces = list(dict.fromkeys(arguments.traces))
-    outputs = [arguments.outputs, arguments.schedule, arguments.events, arguments.plot]
+    outputs = [*(getattr(arguments, name) for name in _SINGLE), arguments.plot]
     if arguments.strided and len(arguments.traces) > 1:
         raise LaeError("--strided goes with one trace at a time")
     timing = [arguments.timing] if arguments.timing else []
@@ -189,6 +197,8 @@ class _Job:
             raise LaeError("vot-realtime never scores latency: it goes with no permitted latency")
         if at_arrival and arguments.cost:
             raise LaeError("vot-realtime never scores latency: it goes with no --cost")
+        if at_arrival and arguments.timeline:
+            raise LaeError("vot-realtime never scores latency: it goes with no --timeline")
         source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
         trace = read_trace(path, arguments.sequence)
         timing = read_trace(arguments.timing) if arguments.timing else None
@@ -271,6 +281,7 @@ def _sinks(
 
     from lae_sim import export
     from lae_sim.evaluation import answers
+    from lae_sim.timeline import timeline_file
 
     sinks: list[Callable[[Run], None]] = []
     answer_sinks: list[export.AnswerSink] = []
@@ -279,6 +290,10 @@ def _sinks(
     if arguments.events:
         events = export.events_file(arguments.events, arguments.sigma[0], job.at_arrival)
         sinks.append(files.enter_context(events))
+    if arguments.timeline:
+        costs = {name: job.costs.get(name, 0) for name in arguments.forecaster}
+        drawn = timeline_file(arguments.timeline, arguments.sigma[0], costs)
+        sinks.append(files.enter_context(drawn))
     if arguments.outputs:
         answer_sinks.append(files.enter_context(export.outputs_file(arguments.outputs)))
     if arguments.export_txt:
