@@ -20,6 +20,7 @@ COMMANDS = {
     "render": "draw a replay over its frames, as a film or a contact sheet",
     "replay": "replay traces and score them, latency counted",
     "show": "say what a trace holds: provenance, times, stalls, drift",
+    "study": "replay and score traces in every way, on all cores or a cluster: tables and report",
     "train": "train the learned forecaster on traces",
 }
 

@@ -94,7 +94,7 @@ def summarise(
         if not count or not present:
             continue
         if count not in weights:
-            weights[count] = _weights(count, resamples, seed)
+            weights[count] = bootstrap_weights(count, resamples, seed)
         scores = np.ascontiguousarray(group[present].to_numpy(np.float64).T)
         columns = _compared(scores, present, weights[count], baselines, confidence)
         columns = {"forecaster": present, "sequences": count, **columns}
@@ -172,7 +172,7 @@ def _wide(table: pd.DataFrame, metrics: Sequence[str]) -> tuple[pd.DataFrame, di
     return wide, order
 
 
-def _weights(count: int, resamples: int, seed: int) -> Floats:
+def bootstrap_weights(count: int, resamples: int, seed: int) -> Floats:
     """Share of each sequence in each resample, float64 [resamples, count]; rows sum to 1."""
     generator = np.random.Generator(np.random.PCG64(seed))
     return generator.multinomial(count, np.full(count, 1 / count), size=resamples) / count

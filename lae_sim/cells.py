@@ -1,0 +1,389 @@
+"""The cells of a study: one forecaster and convention on one replay of one trace.
+
+A cell is named by a digest of all that its figures depend on, so that a finished one is found
+again, and one whose input has changed is not. Cells of the same replay are computed together.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from lae_sim import __version__
+from lae_sim.evaluation import Evaluation, evaluate_groups
+from lae_sim.forecast import AnyFactory
+from lae_sim.metrics import METRICS, find_convention
+from lae_sim.notes import notes_on
+from lae_sim.run import Run
+from lae_sim.trace import read_trace
+
+VERSION = 1
+"""Of the cells' files; another version is another cell."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """A trace that a study reads.
+
+    Attributes:
+        path: file or URL.
+        label: its name in tables.
+        digest: SHA-256 of its content.
+    """
+
+    path: str
+    label: str
+    digest: str
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to replay one trace.
+
+    Attributes:
+        trace: the boxes and the truth.
+        timing: another device's trace that the times come from.
+        policy, latency: names.
+        fps: world frame rate.
+        scale: exact factor on all times.
+        first, count: which repetitions of a random latency; 0 and 1 of any other.
+        seed, block: of a random latency.
+        sigmas: permitted latencies, frames, ascending.
+        sequences: those wanted; all if empty.
+    """
+
+    trace: Input
+    timing: Input | None
+    policy: str
+    fps: Fraction
+    latency: str
+    scale: Fraction
+    first: int
+    count: int
+    seed: int
+    block: int
+    sigmas: tuple[Fraction, ...]
+    sequences: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Plain values of all that the rows depend on: labels and contents of files, not paths."""
+        return {
+            "trace": [self.trace.label, self.trace.digest],
+            "timing": self.timing and [self.timing.label, self.timing.digest],
+            "policy": self.policy,
+            "fps": str(self.fps),
+            "latency": self.latency,
+            "scale": str(self.scale),
+            "first": self.first,
+            "count": self.count,
+            "seed": self.seed,
+            "block": self.block,
+            "sigmas": [str(sigma) for sigma in self.sigmas],
+            "sequences": list(self.sequences),
+        }
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One forecaster and convention on one replay.
+
+    Attributes:
+        setting: the replay.
+        forecaster: its name.
+        code: what else it depends on: a digest of its file or of its training.
+        cost_ns: what an answer costs.
+        convention: how frames and thresholds count.
+    """
+
+    setting: Setting
+    forecaster: str
+    code: str
+    cost_ns: int
+    convention: str
+
+    @property
+    def key(self) -> str:
+        """Digest of all that the figures depend on."""
+        document = {
+            "lae_sim": __version__,
+            "version": VERSION,
+            "setting": self.setting.document(),
+            "forecaster": self.forecaster,
+            "code": self.code,
+            "cost_ns": self.cost_ns,
+            "convention": self.convention,
+        }
+        return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:32]
+
+
+@dataclass(frozen=True)
+class Task:
+    """Cells of one replay, to be computed together.
+
+    Attributes:
+        cells: of the same setting.
+        factories: their forecasters, by name.
+    """
+
+    cells: tuple[Cell, ...]
+    factories: Mapping[str, AnyFactory]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What was computed of a cell.
+
+    Attributes:
+        key: the cell's.
+        rows: a Parquet file, a row per sequence, repetition and sigma (see :data:`COLUMNS`).
+        about: curves at the first sigma, how many outputs are approximate, the engine, notes.
+    """
+
+    key: str
+    rows: bytes
+    about: dict[str, Any]
+
+
+COLUMNS = {
+    "trace": "string",
+    "tracker": "string",
+    "dataset": "string",
+    "times_from": "string",
+    "policy": "string",
+    "fps": "string",
+    "latency": "string",
+    "scale": "string",
+    "convention": "string",
+    "forecaster": "string",
+    "sequence": "string",
+    "repetition": "int32",
+    "sigma": "float64",
+    "world_frames": "int32",
+    "processed": "int32",
+    "approximate_outputs": "int32",
+    "elapsed_ms": "float64",
+    "mismatch_mean": "float64",
+    "mismatch_max": "int32",
+    "longest_hold": "int32",
+    "failure_frame": "int32",
+    **dict.fromkeys(METRICS, "float64"),
+    **{f"offline_{metric}": "float64" for metric in METRICS},
+}
+"""Columns of the results, and their types.
+
+``elapsed_ms`` is the mean time of the calls but the initialisation, ``longest_hold`` and the
+mismatches are in frames, ``failure_frame`` is the first whose answer does not overlap the truth
+(``world_frames`` if there is none); scores are in 0..1, NaN where the sequence leaves the mean or,
+offline, where the trace lacks boxes.
+"""
+
+
+def compute(task: Task) -> list[Result]:
+    """Replay once for each convention, and score.
+
+    Raises:
+        LaeError: whatever replaying and scoring raise.
+    """
+    conventions = dict.fromkeys(cell.convention for cell in task.cells)
+    return [
+        result
+        for convention in conventions
+        for result in _computed(
+            [cell for cell in task.cells if cell.convention == convention], task.factories
+        )
+    ]
+
+
+def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> list[Result]:
+    """The results of cells of one setting and one convention."""
+    setting, convention = cells[0].setting, find_convention(cells[0].convention)
+    trace = read_trace(setting.trace.path, setting.sequences or None)
+    chosen = {cell.forecaster: factories[cell.forecaster] for cell in cells}
+    costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
+    writers = [_Rows(cell, trace.metadata.tracker, trace.metadata.dataset) for cell in cells]
+    replay = replayed(setting)
+    repetitions: list[int] = []
+
+    def runs() -> Iterator[Run]:
+        for repetition, run in replay.runs:
+            repetitions.append(repetition)
+            yield run
+
+    curves, kept = _Curves(), []
+    for part in evaluate_groups(
+        runs(), trace.metadata, chosen, setting.sigmas, convention, costs=costs
+    ):
+        entries = len(part.sequences)
+        for f, writer in enumerate(writers):
+            writer.add(part, f, np.array(repetitions[:entries], np.int32))
+        del repetitions[:entries]
+        curves.add(part)
+        kept.append(_slim(part))
+    about = Evaluation.joined(kept)
+    results = []
+    for f, (cell, writer) in enumerate(zip(cells, writers)):
+        only = {cell.forecaster: chosen[cell.forecaster]}
+        details = {
+            "engine": replay.engine,
+            "curves": curves.means(f),
+            "approximate_outputs": int(about.departures.sum()),
+            "calls": int((about.processed - 1).sum()),
+            "notes": notes_on(about, trace.metadata, convention, only, at_arrival=False),
+        }
+        results.append(Result(cell.key, writer.finish(), details))
+    return results
+
+
+def _slim(part: Evaluation) -> Evaluation:
+    """The part without its scores: what notes are about."""
+    none = np.zeros((1, len(part.sequences), 0))
+    return replace(
+        part,
+        scores=dict.fromkeys(METRICS, none),
+        failure=none.astype(np.int64),
+        success=none,
+        precision=none,
+        offline_success=none[0],
+        offline_precision=none[0],
+    )
+
+
+class _Curves:
+    """Mean success and precision curves over sequences and repetitions, at the first sigma."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, Any] = {}
+        self._counts: dict[str, Any] = {}
+
+    def add(self, part: Evaluation) -> None:
+        offline = part.offline_success[None], part.offline_precision[None]
+        named = {
+            "success": np.concatenate([part.success, offline[0]]),
+            "precision": np.concatenate([part.precision, offline[1]]),
+        }
+        for name, curves in named.items():
+            self._sums[name] = self._sums.get(name, 0) + np.nansum(curves, axis=1)
+            known = (~np.isnan(curves[:, :, 0])).sum(axis=1)
+            self._counts[name] = self._counts.get(name, 0) + known
+
+    def means(self, f: int) -> dict[str, list[float] | None]:
+        """Those of a forecaster, and offline."""
+        found: dict[str, list[float] | None] = {}
+        for name, sums in self._sums.items():
+            for label, which in ((name, f), (f"offline_{name}", -1)):
+                count = int(self._counts[name][which])
+                found[label] = (sums[which] / count).tolist() if count else None
+        return found
+
+
+class _Rows:
+    """Writes the rows of one cell, group after group."""
+
+    def __init__(self, cell: Cell, tracker: str, dataset: str) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        setting = cell.setting
+        self._sigmas = np.array([float(sigma) for sigma in setting.sigmas])
+        self._constant = {
+            "trace": setting.trace.label,
+            "tracker": tracker,
+            "dataset": dataset,
+            "times_from": (setting.timing or setting.trace).label,
+            "policy": setting.policy,
+            "fps": str(setting.fps),
+            "latency": setting.latency,
+            "scale": str(setting.scale),
+            "convention": cell.convention,
+            "forecaster": cell.forecaster,
+        }
+        self._schema = pa.schema([pa.field(name, kind) for name, kind in COLUMNS.items()])
+        self._file = io.BytesIO()
+        texts = [name for name, kind in COLUMNS.items() if kind == "string"]
+        self._writer = pq.ParquetWriter(
+            self._file, self._schema, compression="zstd", use_dictionary=texts
+        )
+
+    def add(self, part: Evaluation, f: int, repetitions: Any) -> None:
+        """Add a row for each sequence of a part and each sigma."""
+        import pyarrow as pa
+
+        from lae_sim.arrow import from_numpy
+
+        count = len(self._sigmas)
+        calls = np.maximum(part.processed - 1, 1)
+        once = {  # by sequence
+            "repetition": repetitions,
+            "world_frames": part.frames,
+            "processed": part.processed,
+            "approximate_outputs": part.departures,
+            "elapsed_ms": part.calls_ns / calls / 1e6,
+            **{f"offline_{metric}": part.offline[metric] for metric in METRICS},
+        }
+        values = {name: np.repeat(column, count) for name, column in once.items()}
+        values |= {  # by sequence and sigma
+            "mismatch_mean": (part.mismatch_sum / part.frames[:, None]).ravel(),
+            "mismatch_max": part.mismatch_max.ravel(),
+            "longest_hold": part.longest_hold.ravel(),
+            "failure_frame": part.failure[f].ravel(),
+            **{metric: part.scores[metric][f].ravel() for metric in METRICS},
+        }
+        values["sigma"] = np.tile(self._sigmas, len(part.sequences))
+        rows = len(values["sigma"])
+        names = pa.array(part.sequences).take(
+            from_numpy(np.repeat(np.arange(rows // count), count))
+        )
+        columns = {
+            **{name: pa.repeat(text, rows) for name, text in self._constant.items()},
+            "sequence": names,
+            **{name: from_numpy(column.astype(COLUMNS[name])) for name, column in values.items()},
+        }
+        arrays = [columns[name] for name in COLUMNS]
+        self._writer.write_batch(pa.record_batch(arrays, schema=self._schema))
+
+    def finish(self) -> bytes:
+        """The file's bytes."""
+        self._writer.close()
+        return self._file.getvalue()
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """The runs of a setting.
+
+    Attributes:
+        runs: repetition and run, as they are made.
+        engine: ``"batch"``, or ``"simpy"`` where the policy or the latency knows no lanes.
+    """
+
+    runs: Iterable[tuple[int, Run]]
+    engine: str
+
+
+def replayed(setting: Setting) -> Replayed:
+    """Replay a setting."""
+    from lae_sim.latency import scaled
+    from lae_sim.options import parse_latency, parse_policy
+    from lae_sim.run import replay_trace
+
+    trace = read_trace(setting.trace.path, setting.sequences or None)
+    timing = None if setting.timing is None else read_trace(setting.timing.path)
+    policy, _ = parse_policy(setting.policy)
+
+    def runs() -> Iterator[tuple[int, Run]]:
+        for repetition in range(setting.first, setting.first + setting.count):
+            named = setting.latency + (
+                f":{setting.seed}" if setting.block or setting.count > 1 else ""
+            )
+            source = scaled(parse_latency(named), setting.scale)
+            for run in replay_trace(trace, setting.fps, source, policy, timing):
+                yield repetition, run
+
+    return Replayed(runs(), "simpy")

@@ -1,0 +1,129 @@
+"""What a required AUC asks of a device: how slow may the tracker be, how fast the world."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from lae_sim.cells import Cell, replayed
+from lae_sim.evaluation import evaluate_groups
+from lae_sim.forecast import AnyFactory
+from lae_sim.metrics import find_convention
+from lae_sim.trace import read_trace
+
+STEP = Fraction(1, 100)
+MOST = 1 << 13
+"""Scales are looked for in hundredths, up to 81.92 times slower."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """The search for the slowest device on which a tracker still has a mean AUC.
+
+    Attributes:
+        cell: what is replayed, at other scales than its own, at its first sigma.
+        factory: its forecaster.
+        required: the mean AUC.
+    """
+
+    cell: Cell
+    factory: AnyFactory
+    required: Fraction
+
+    @property
+    def key(self) -> str:
+        """Digest of all that the answer depends on."""
+        told = f"{self.cell.key} {self.required} {STEP} {MOST}"
+        return hashlib.sha256(told.encode()).hexdigest()[:32]
+
+
+def searches(
+    cells: Sequence[Cell], factories: Mapping[str, AnyFactory], required: Fraction
+) -> list[Search]:
+    """One search for all cells that differ in their scale or repetitions alone."""
+    found: dict[str, Search] = {}
+    for cell in cells:
+        setting = replace(cell.setting, scale=Fraction(1), first=0, sigmas=cell.setting.sigmas[:1])
+        if cell.setting.first == 0:
+            search = Search(replace(cell, setting=setting), factories[cell.forecaster], required)
+            found.setdefault(search.key, search)
+    return list(found.values())
+
+
+def slowest(search: Search) -> dict[str, Any]:
+    """The largest scale of all times at which the mean AUC is what is required.
+
+    Found by bisection over hundredths, as if the AUC fell with every step; the scale and the next
+    one are both replayed, so that what is told of these two is exact.
+
+    Returns:
+        ``scale`` and ``beyond``, the hundredth after it, as text, with their ``auc`` and
+        ``beyond_auc``; ``auc_without_latency``. ``scale`` is None if even without latency the AUC
+        is too low, ``beyond`` if it is enough at the largest scale that is tried.
+    """
+    known: dict[int, float] = {}
+
+    def enough(step: int) -> bool:
+        if step not in known:
+            known[step] = mean_auc(search, step * STEP)
+        return known[step] >= search.required
+
+    found: dict[str, Any] = dict.fromkeys(("scale", "auc", "beyond", "beyond_auc"))
+    if not enough(0):
+        found |= {"beyond": "0", "beyond_auc": known[0]}
+    else:
+        low, high = 0, 1
+        while high <= MOST and enough(high):
+            low, high = high, 2 * high
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if enough(middle) else (low, middle)
+        found |= {"scale": str(low * STEP), "auc": known[low]}
+        if high in known:
+            found |= {"beyond": str(high * STEP), "beyond_auc": known[high]}
+    return {**found, "auc_without_latency": known[0]}
+
+
+def mean_auc(search: Search, scale: Fraction) -> float:
+    """The mean AUC over sequences and repetitions at a scale of all times."""
+    cell = search.cell
+    setting = replace(cell.setting, scale=scale)
+    metadata = read_trace(setting.trace.path).metadata
+    parts: Iterator[Any] = evaluate_groups(
+        (run for _, run in replayed(setting).runs),
+        metadata,
+        {cell.forecaster: search.factory},
+        setting.sigmas,
+        find_convention(cell.convention),
+        costs={cell.forecaster: cell.cost_ns},
+    )
+    return float(np.nanmean(np.concatenate([part.scores["auc"][0, :, 0] for part in parts])))
+
+
+def requirement(search: Search, found: Mapping[str, Any]) -> dict[str, Any]:
+    """The answer as a row.
+
+    A schedule depends on processing times in frames alone, so times scaled by f are a world of f
+    times the rate (but for the rounding to whole ns).
+    """
+    setting = search.cell.setting
+    scale = None if found["scale"] is None else Fraction(found["scale"])
+    return {
+        "trace": setting.trace.label,
+        "times_from": (setting.timing or setting.trace).label,
+        "policy": setting.policy,
+        "fps": str(setting.fps),
+        "latency": setting.latency,
+        "convention": search.cell.convention,
+        "forecaster": search.cell.forecaster,
+        "sigma": str(setting.sigmas[0]),
+        "required_auc": float(search.required),
+        **found,
+        "speed_up": None if not scale else float(1 / scale),
+        "fps_at_most": None if scale is None else float(scale * setting.fps),
+    }

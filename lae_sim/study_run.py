@@ -1,0 +1,236 @@
+"""Running a study: the plan's cells, on whatever workers there are, and what comes out of them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lae_sim import __version__
+from lae_sim.cells import Task, compute
+from lae_sim.deployment import Search, requirement, searches, slowest
+from lae_sim.errors import LaeError
+from lae_sim.execute import Failure, Store, cluster_executor, local_executor, run_all
+from lae_sim.files import written_whole
+from lae_sim.plan import Plan, Source, make_plan
+from lae_sim.study_file import Study
+from lae_sim.study_summary import Row, Scores, compare_traces, read_scores, summarise_study
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+@dataclass(frozen=True, eq=False)
+class StudyResults:
+    """What a study found.
+
+    Attributes:
+        folder: where it is kept.
+        plan: what was computed.
+        scores: of every finished trace, setting, convention and forecaster.
+        summary: rows (see :func:`lae_sim.study_summary.summarise_study`).
+        comparisons: pairs of traces (see :func:`lae_sim.study_summary.compare_traces`).
+        required: what a required AUC asks for (see :func:`lae_sim.deployment.requirement`).
+        traces: what ``lae-sim show --json`` says of each trace.
+        computed: how many cells were computed now, and not found finished.
+        failures: what could not be computed, and why.
+    """
+
+    folder: Path
+    plan: Plan
+    scores: tuple[Scores, ...]
+    summary: tuple[Row, ...]
+    comparisons: tuple[Row, ...]
+    required: tuple[Row, ...]
+    traces: tuple[Row, ...]
+    computed: int
+    failures: tuple[Row, ...]
+
+    def table(self) -> DataFrame:
+        """Every score of every sequence, repetition and sigma (columns: ``lae_sim.cells``)."""
+        import pandas as pd
+
+        store = Store(self.folder)
+        files = [store.rows(cell) for cell in self.plan.cells if store.has(cell)]
+        return pd.concat(map(pd.read_parquet, files), ignore_index=True)
+
+    def notes(self) -> list[str]:
+        """What keeps the figures from being what their names promise, each once."""
+        told = [note for scores in self.scores for about in scores.about for note in about["notes"]]
+        of_traces = [f"{trace['trace']}: {text}" for trace in self.traces
+                     for text in trace["warnings"]]  # fmt: skip
+        return list(dict.fromkeys([*self.plan.notes, *told, *of_traces]))
+
+    def document(self) -> dict[str, Any]:
+        """All but the scores of single sequences, as ``study.json`` holds it."""
+        return {
+            "format": "lae-study",
+            "version": "1.0",
+            "lae_sim": __version__,
+            "study": self.plan.study.document(),
+            "cells": len(self.plan.cells),
+            "failures": self.failures,
+            "notes": self.notes(),
+            "summary": self.summary,
+            "comparisons": self.comparisons,
+            "required": self.required,
+            "traces": self.traces,
+        }
+
+
+def run_study(
+    study: Study,
+    folder: str | os.PathLike[str],
+    base: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[str, int, int], object] = lambda what, done, total: None,
+) -> StudyResults:
+    """Compute what is not yet finished, and sum up.
+
+    Args:
+        study: what is asked for.
+        folder: where results are kept; finished cells found there are not computed again.
+        base: the folder that relative paths of traces are from; the current one by default.
+        workers: processes on this machine; by default one for each core. No result depends on it.
+        scheduler: address of a Dask cluster to compute on instead, such as ``tcp://host:8786``;
+            its workers must see the traces under the same paths.
+        progress: told what is going on, how much of it is done, and of how much.
+
+    Raises:
+        LaeError: if the study cannot be planned, nothing could be computed, or a worker died.
+    """
+    plan = make_plan(study, base, lambda what: progress(what, 0, 1))
+    store = Store(folder)
+    store.prepare(plan.cells)
+    asked = [] if study.require_auc is None else searches(
+        plan.cells, plan.factories, study.require_auc
+    )  # fmt: skip
+    described = [_About(source, study.sequences) for source in plan.sources]
+    works: list[_About | Task | Search] = [
+        *(about for about in described if store.found(about.key) is None),
+        *plan.tasks(store.has),
+        *(search for search in asked if store.found(search.key) is None),
+    ]
+    failures, computed = [], 0
+    count = min(workers or _cores(), max(len(works), 1))
+    with _executor(count, scheduler) as (executor, size):
+        for done, (work, result) in enumerate(run_all(perform, works, executor, size)):
+            progress("", done + 1, len(works))
+            if isinstance(result, Failure):
+                failures.append({"of": _told(work), "reason": result.reason})
+            elif isinstance(work, Task):
+                computed += len(result)
+                for each in result:
+                    store.put(each)
+            else:
+                store.keep(work.key, result)
+    progress("summing up", len(works), len(works))
+    scores = tuple(read_scores(plan, store))
+    if not scores:
+        raise LaeError(f"nothing could be computed: {failures[0]['reason']}")
+    summary = tuple(summarise_study(scores, study.seed))
+    results = StudyResults(
+        folder=store.folder,
+        plan=plan,
+        scores=scores,
+        summary=summary,
+        comparisons=tuple(compare_traces(scores, study.seed)),
+        required=tuple(
+            requirement(search, found) for search in asked if (found := store.found(search.key))
+        ),
+        traces=tuple(found for about in described if (found := store.found(about.key))),
+        computed=computed,
+        failures=tuple(sorted(failures, key=str)),
+    )
+    _write(results)
+    return results
+
+
+@dataclass(frozen=True)
+class _About:
+    """A trace that is to be described."""
+
+    source: Source
+    sequences: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """Names the description."""
+        return f"{self.source.input.digest[:32]}-trace"
+
+
+def perform(work: _About | Task | Search) -> Any:
+    """Do a piece of a study's work, on some worker."""
+    if isinstance(work, Task):
+        return compute(work)
+    if isinstance(work, Search):
+        return slowest(work)
+    from lae_sim.show import describe
+    from lae_sim.trace import read_trace
+
+    return describe(read_trace(work.source.input.path), work.source.input.label)[0]
+
+
+def _told(work: _About | Task | Search) -> str:
+    """What a piece of work is about."""
+    if isinstance(work, _About):
+        return work.source.input.label
+    setting = work.cells[0].setting if isinstance(work, Task) else work.cell.setting
+    times = "" if setting.timing is None else f" at {setting.timing.label}"
+    return (
+        f"{setting.trace.label}{times}, {setting.policy}, {setting.fps} fps, "
+        f"{setting.latency} x {setting.scale}"
+    )
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _executor(
+    workers: int, scheduler: str | None
+) -> Iterator[tuple[Executor | None, Callable[[], int]]]:
+    if scheduler is not None:
+        with cluster_executor(scheduler) as found:
+            yield found
+    elif workers == 1:
+        yield None, lambda: 1
+    else:
+        with local_executor(workers) as executor:
+            yield executor, lambda: workers
+
+
+def _write(results: StudyResults) -> None:
+    """Write the summary, as CSV and JSON."""
+    tables = {
+        "summary": results.summary,
+        "comparisons": results.comparisons,
+        "required": results.required,
+    }
+    for name, rows in tables.items():
+        path = results.folder / f"{name}.csv"
+        if rows:
+            write_csv(rows, path)
+        else:
+            path.unlink(missing_ok=True)
+    with written_whole(results.folder / "study.json") as temporary:
+        temporary.write_text(json.dumps(results.document(), indent=1, allow_nan=False))
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> None:
+    """Write rows as CSV, whole or not at all; what is unknown is empty."""
+    columns = list(dict.fromkeys(chain.from_iterable(rows)))
+    with written_whole(path) as temporary, open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

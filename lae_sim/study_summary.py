@@ -1,0 +1,424 @@
+"""The summary of a study: means with intervals, what latency costs, how stale answers are.
+
+Two things are uncertain, and told apart. *Sequences*: 95 % percentile bootstrap over them, of the
+scores averaged over the repetitions; *jitter*: the range that holds 95 % of the repetitions' means,
+for these very sequences. Resamples depend on the seed and the number of sequences alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from lae_sim.boxes import Floats
+from lae_sim.cells import Cell, Setting
+from lae_sim.clock import Clock
+from lae_sim.execute import Store
+from lae_sim.metrics import METRICS
+from lae_sim.pairing import SIGMA_GRID
+from lae_sim.plan import Plan, Source
+from lae_sim.statistics import bootstrap_weights, signed_rank_p
+
+RESAMPLES = 10_000
+MEAN = "mean"
+"""Stands for sigma where scores are plain means over all permitted latencies (mAUC, mDP)."""
+
+Row = dict[str, Any]
+_TAILS = (0.025, 0.975)
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """The finished cells of one trace, setting, convention and forecaster, all repetitions.
+
+    Attributes:
+        source: the trace.
+        setting: the first of the settings, which differ in their repetitions.
+        forecaster, convention: names.
+        sequences: names, S of them.
+        means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``,
+            ``mismatch_max``, ``longest_hold`` (frames).
+        repeated: ``auc``, ``dp20`` and ``failure_frame`` at the first sigma, float64 [R, S].
+        over_sigmas: ``auc`` and ``dp20`` as plain means over sigma, float64 [R, S].
+        once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms`` and the offline
+            scores, float64 [S].
+        about: of each cell (see :class:`lae_sim.cells.Result`).
+    """
+
+    source: Source
+    setting: Setting
+    forecaster: str
+    convention: str
+    sequences: tuple[str, ...]
+    means: Mapping[str, Floats]
+    repeated: Mapping[str, Floats]
+    over_sigmas: Mapping[str, Floats]
+    once: Mapping[str, Floats]
+    about: tuple[Mapping[str, Any], ...]
+
+    @property
+    def group(self) -> tuple[str, ...]:
+        """What scores must share to be compared: dataset, world, latency, convention."""
+        setting = self.setting
+        return (
+            self.source.metadata.dataset,
+            setting.policy,
+            str(setting.fps),
+            setting.latency,
+            str(setting.scale),
+            self.convention,
+        )
+
+
+_STALENESS = ("mismatch_mean", "mismatch_max", "longest_hold")
+_REPEATED = ("auc", "dp20", "failure_frame")
+_ONCE = ("world_frames", "processed", "elapsed_ms", *(f"offline_{m}" for m in METRICS))
+
+
+def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
+    """The finished cells of a study, in the order of the plan; one after another."""
+    sources = {source.input: source for source in plan.sources}
+    together: dict[tuple[Any, ...], list[Cell]] = {}
+    for cell in plan.cells:
+        document = cell.setting.document()
+        same = str({**document, "first": 0, "count": 0})
+        together.setdefault((same, cell.forecaster, cell.convention), []).append(cell)
+    for cells in together.values():
+        if all(store.has(cell) for cell in cells):
+            yield _read(cells, sources[cells[0].setting.trace], store)
+
+
+def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
+    """The scores of cells that differ in their repetitions alone."""
+    import pyarrow.parquet as pq
+
+    from lae_sim.arrow import from_numpy, to_numpy
+
+    first = cells[0]
+    count = len(first.setting.sigmas)
+    numbers = [*METRICS, *_STALENESS]
+    sums: dict[str, Any] = {}
+    repeated: dict[str, list[Floats]] = {name: [] for name in _REPEATED}
+    over_sigmas: dict[str, list[Floats]] = {name: [] for name in ("auc", "dp20")}
+    names: tuple[str, ...] = ()
+    for cell in cells:
+        with pq.ParquetFile(store.rows(cell)) as file:
+            wanted = dict.fromkeys([*numbers, *_REPEATED, *_ONCE, "sequence", "repetition"])
+            rows = file.read(list(wanted)).combine_chunks()
+
+        def column(name: str, rows: Any = rows) -> Floats:
+            chunk = rows.column(name).chunk(0)
+            return to_numpy(chunk, chunk.type.to_pandas_dtype()).astype(np.float64)
+
+        entries = rows.num_rows // count
+        told = (
+            rows.column("sequence").take(from_numpy(np.arange(0, rows.num_rows, count))).to_pylist()
+        )
+        names = tuple(sorted(set(told)))
+        place = {name: s for s, name in enumerate(names)}
+        order = np.lexsort((  # by repetition, then by sequence
+            np.array([place[name] for name in told]), column("repetition")[::count],
+        ))  # fmt: skip
+        shape = (cell.setting.count, len(names), count)
+        assert entries == shape[0] * shape[1]
+        for name in dict.fromkeys([*numbers, *_REPEATED, *_ONCE]):
+            values = column(name).reshape(entries, count)[order].reshape(shape)
+            if name in _REPEATED:
+                repeated[name].append(values[:, :, 0])
+            if name in over_sigmas:
+                over_sigmas[name].append(values.mean(axis=2))
+            values = values[:, :, 0] if name in _ONCE else values
+            sums[name] = sums.get(name, 0) + values.sum(axis=0)
+    total = sum(cell.setting.count for cell in cells)
+    return Scores(
+        source=source,
+        setting=first.setting,
+        forecaster=first.forecaster,
+        convention=first.convention,
+        sequences=names,
+        means={name: sums[name] / total for name in numbers},
+        repeated={name: np.concatenate(parts) for name, parts in repeated.items()},
+        over_sigmas={name: np.concatenate(parts) for name, parts in over_sigmas.items()},
+        once={name: sums[name] / total for name in _ONCE},
+        about=tuple(store.about(cell) for cell in cells),
+    )
+
+
+def summarise_study(
+    scores: Sequence[Scores], seed: int = 0, resamples: int = RESAMPLES
+) -> list[Row]:
+    """A row per trace, setting, convention, forecaster and sigma, and one of their means.
+
+    Args:
+        scores: all of a study.
+        seed: of the resamples.
+        resamples: of the bootstrap.
+
+    Returns:
+        Rows with the columns of the README; what is unknown is None. Intervals and tests stand in
+        the rows of the first sigma and of the mean over sigma.
+    """
+    hold = {(*_identity(s),): s for s in scores if s.forecaster == "hold"}
+    weights: dict[int, Floats] = {}
+    rows = []
+    for each in scores:
+        base = hold.get(_identity(each))
+        ours = [*_rows(each, base, seed, resamples, weights)]
+        rows += ours
+    _mark_front(rows)
+    return rows
+
+
+def _identity(scores: Scores) -> tuple[str, ...]:
+    """What a forecaster and hold share."""
+    setting = scores.setting
+    times = "" if setting.timing is None else setting.timing.label
+    return (setting.trace.label, times, *scores.group)
+
+
+def _rows(
+    scores: Scores, hold: Scores | None, seed: int, resamples: int, weights: dict[int, Floats]
+) -> Iterator[Row]:
+    setting, metadata = scores.setting, scores.source.metadata
+    clock = Clock.at(setting.fps)
+    departures = sum(about["approximate_outputs"] for about in scores.about)
+    calls = sum(about["calls"] for about in scores.about)
+    told = {
+        "trace": setting.trace.label,
+        "tracker": metadata.tracker,
+        "dataset": metadata.dataset,
+        "device": metadata.device,
+        "times_from": (setting.timing or setting.trace).label,
+        "policy": setting.policy,
+        "fps": str(setting.fps),
+        "latency": setting.latency,
+        "scale": str(setting.scale),
+        "convention": scores.convention,
+        "forecaster": scores.forecaster,
+        "sequences": len(scores.sequences),
+        "repetitions": len(scores.repeated["auc"]),
+        "engine": scores.about[0]["engine"],
+        "exact": departures == 0,
+        "approximate_share": departures / calls if calls else 0.0,
+        "elapsed_ms": _mean(scores.once["elapsed_ms"]),
+        "skip_rate": 1 - scores.once["processed"].sum() / scores.once["world_frames"].sum(),
+    }
+    offline = {f"offline_{m}": _mean(scores.once[f"offline_{m}"]) for m in METRICS}
+    frames = scores.once["world_frames"]
+    for s, sigma in enumerate(setting.sigmas):
+        at = {metric: scores.means[metric][:, s] for metric in METRICS}
+        row: Row = {**told, "sigma": str(sigma), **{m: _mean(v) for m, v in at.items()}, **offline}
+        if s == 0:
+            row |= _uncertain(scores, hold, "repeated", seed, resamples, weights)
+        row |= _stale(scores, s, sigma, clock, frames)
+        yield row
+    if set(SIGMA_GRID) <= set(setting.sigmas):
+        grid = [s for s, sigma in enumerate(setting.sigmas) if sigma in SIGMA_GRID]
+        means = {m: _mean_of_means(scores.means[m][:, grid]) for m in METRICS}
+        row = {**told, "sigma": MEAN, **means, **offline}
+        if len(grid) == len(setting.sigmas):
+            row |= _uncertain(scores, hold, "over_sigmas", seed, resamples, weights)
+        yield row
+
+
+def _uncertain(
+    scores: Scores,
+    hold: Scores | None,
+    which: str,
+    seed: int,
+    resamples: int,
+    weights: dict[int, Floats],
+) -> Row:
+    """Intervals of the means, what is won over hold, and the share of the loss recovered."""
+    found: Row = {}
+    for metric in ("auc", "dp20"):
+        ours = getattr(scores, which)[metric]
+        base = None if hold is None or hold is scores else getattr(hold, which)[metric]
+        offline = scores.once[f"offline_{metric}"]
+        kept = ~np.isnan(ours.mean(axis=0))
+        if base is not None:
+            kept &= ~np.isnan(base.mean(axis=0))
+        if not kept.any():
+            continue
+        count = int(kept.sum())
+        if count not in weights:
+            weights[count] = bootstrap_weights(count, resamples, seed)
+        drawn = weights[count]
+        mean = ours[:, kept].mean(axis=0)
+        resampled = np.einsum("s,rs->r", mean, drawn)
+        found[f"{metric}_low"], found[f"{metric}_high"] = _ends(resampled)
+        if len(ours) > 1:
+            jitter = _ends(ours[:, kept].mean(axis=1))
+            found[f"{metric}_jitter_low"], found[f"{metric}_jitter_high"] = jitter
+        if base is None:
+            continue
+        bare = base[:, kept].mean(axis=0)
+        won = resampled - np.einsum("s,rs->r", bare, drawn)
+        found[f"vs_hold_{metric}"] = float(mean.mean() - bare.mean())
+        found[f"vs_hold_{metric}_low"], found[f"vs_hold_{metric}_high"] = _ends(won)
+        found[f"vs_hold_{metric}_p"] = signed_rank_p(np.round(mean - bare, 12))
+        if not np.isnan(offline[kept]).any():
+            loss = float(offline[kept].mean() - bare.mean())
+            lost = np.einsum("s,rs->r", offline[kept] - bare, drawn)
+            if loss > 0:
+                found[f"recovered_{metric}"] = float(mean.mean() - bare.mean()) / loss
+            if (lost > 0).all():
+                shares = _ends(won / lost)
+                found[f"recovered_{metric}_low"], found[f"recovered_{metric}_high"] = shares
+    return found
+
+
+def _stale(scores: Scores, s: int, sigma: Fraction, clock: Clock, frames: Floats) -> Row:
+    """How old answers are, and how long the target is held, in world time."""
+    mismatch = scores.means["mismatch_mean"][:, s] * frames
+    mean = float(mismatch.sum() / frames.sum())
+    frame_ms = clock.milliseconds(1)
+    row = {
+        "mismatch_mean": mean,
+        "age_ms": (mean + float(sigma)) * frame_ms,
+        "longest_stale_ms": float(scores.means["longest_hold"][:, s].max()) * frame_ms,
+    }
+    if s:
+        return row
+    failure = scores.repeated["failure_frame"]
+    failed = failure < frames
+    median = _median_survival(failure.ravel(), failed.ravel(), frame_ms)
+    return {**row, "failed": float(failed.mean()), "time_to_failure_ms": median}
+
+
+def _median_survival(times: Floats, failed: Any, frame_ms: float) -> float | None:
+    """Median time to failure, ms; None if less than half fail.
+
+    Sequences that end without failure are censored: the estimate is that of Kaplan and Meier,
+    "Nonparametric Estimation from Incomplete Observations", 1958.
+    """
+    alive = 1.0
+    for time in np.unique(times[failed]):
+        alive *= 1 - np.count_nonzero(failed & (times == time)) / np.count_nonzero(times >= time)
+        if alive <= 0.5:
+            return float(time) * frame_ms
+    return None
+
+
+def _mark_front(rows: Sequence[Row]) -> None:
+    """Mark the Pareto front of each setting: no other is both faster and better.
+
+    Compared are the traces of one dataset, world, latency, convention, forecaster and sigma, by the
+    mean time of a call and the AUC.
+    """
+    together: dict[tuple[Any, ...], list[Row]] = {}
+    keys = ("dataset", "policy", "fps", "latency", "scale", "convention", "forecaster", "sigma")
+    for row in rows:
+        together.setdefault(tuple(row[key] for key in keys), []).append(row)
+    for group in together.values():
+        for row in group:
+            row["pareto"] = row["auc"] is not None and not any(
+                other["auc"] >= row["auc"]
+                and other["elapsed_ms"] <= row["elapsed_ms"]
+                and (other["auc"], other["elapsed_ms"]) != (row["auc"], row["elapsed_ms"])
+                for other in group
+                if other["auc"] is not None
+            )
+
+
+def compare_traces(
+    scores: Sequence[Scores], seed: int = 0, resamples: int = RESAMPLES
+) -> list[Row]:
+    """Traces of one dataset against each other: in every setting, with every forecaster.
+
+    Returns:
+        A row per pair, at the first sigma (or, on the whole grid of sigmas, of the means over it):
+        ``difference`` of the mean AUC with its interval; ``p`` of Wilcoxon's signed-rank test over
+        the sequences, and ``p_holm``, corrected for the number of pairs of its group (Holm, "A
+        Simple Sequentially Rejective Multiple Test Procedure", 1979); ``better_here``, how probable
+        it is that one run of A beats one of B on these sequences (0 or 1 without jitter, 1/2 for a
+        tie), and ``better``, the same on other sequences like these (bootstrap, a repetition drawn
+        for each sequence).
+    """
+    together: dict[tuple[str, ...], list[Scores]] = {}
+    for each in scores:
+        together.setdefault((*each.group, each.forecaster), []).append(each)
+    rows = []
+    for group in together.values():
+        ours = [_pair(a, b, seed, resamples) for a, b in combinations(group, 2)]
+        known = [row for row in ours if row is not None]
+        previous = 0.0
+        for rank, row in enumerate(sorted(known, key=lambda row: row["p"])):
+            previous = row["p_holm"] = max(previous, min(1.0, row["p"] * (len(known) - rank)))
+        rows += known
+    return rows
+
+
+def _pair(a: Scores, b: Scores, seed: int, resamples: int) -> Row | None:
+    """A against B; None if they have no sequences in common that count."""
+    whole = set(SIGMA_GRID) == set(a.setting.sigmas)
+    which = "over_sigmas" if whole else "repeated"
+    both = sorted(set(a.sequences) & set(b.sequences))
+    ours, theirs = (
+        getattr(one, which)["auc"][:, [one.sequences.index(name) for name in both]]
+        for one in (a, b)
+    )
+    kept = ~np.isnan(ours.mean(axis=0) + theirs.mean(axis=0))
+    if not kept.any():
+        return None
+    ours, theirs = ours[:, kept], theirs[:, kept]
+    count = ours.shape[1]
+    weights = bootstrap_weights(count, resamples, seed)
+    difference = ours.mean(axis=0) - theirs.mean(axis=0)
+    low, high = _ends(np.einsum("s,rs->r", difference, weights))
+    random = np.random.Generator(np.random.PCG64([seed, count, len(ours), len(theirs)]))
+    margins = np.zeros(resamples)
+    for s in range(count):  # one sequence after another: resamples x sequences would be large
+        run = ours[random.integers(0, len(ours), resamples), s]
+        margins += weights[:, s] * (run - theirs[random.integers(0, len(theirs), resamples), s])
+    here = np.sign(np.round(ours.mean(axis=1)[:, None] - theirs.mean(axis=1), 12))
+    setting = a.setting
+    return {
+        "dataset": a.source.metadata.dataset,
+        "policy": setting.policy,
+        "fps": str(setting.fps),
+        "latency": setting.latency,
+        "scale": str(setting.scale),
+        "convention": a.convention,
+        "forecaster": a.forecaster,
+        "sigma": MEAN if whole else str(setting.sigmas[0]),
+        "a": _run_label(a),
+        "b": _run_label(b),
+        "sequences": count,
+        "difference": float(difference.mean()),
+        "difference_low": low,
+        "difference_high": high,
+        "p": signed_rank_p(np.round(difference, 12)),
+        "better_here": float((here.mean() + 1) / 2),
+        "better": float((np.sign(np.round(margins, 12)).mean() + 1) / 2),
+    }
+
+
+def _run_label(scores: Scores) -> str:
+    """The trace, and the device whose times it was replayed with, if another's."""
+    setting = scores.setting
+    own = setting.timing is None
+    return setting.trace.label + ("" if own else f" at {setting.timing.label}")  # type: ignore[union-attr]  # own
+
+
+def _ends(samples: Floats) -> tuple[float, float]:
+    low, high = np.quantile(samples, _TAILS).tolist()
+    return low, high
+
+
+def _mean(values: Floats) -> float | None:
+    """Mean of the sequences that have a value."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else None
+
+
+def _mean_of_means(values: Floats) -> float | None:
+    """Plain mean over sigma of the means over sequences; values are [S, M]."""
+    means = [_mean(values[:, s]) for s in range(values.shape[1])]
+    known = [mean for mean in means if mean is not None]
+    return float(np.mean(known)) if len(known) == len(means) else None
