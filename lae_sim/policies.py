@@ -2,15 +2,36 @@
 
 Each is a plain function of the clock and the calls so far (see :data:`lae_sim.engine.Policy`), or
 makes one. The last call's frame is the last one processed, the tick when it was ready is *now*, and
-``now // clock.frame_ticks`` is the newest frame that has arrived (equality counts).
+``now // clock.frame_ticks`` is the newest frame that has arrived (equality counts). Those that need
+no more than these two say so by a second method, :class:`LanePolicy`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
 
 from lae_sim.clock import Clock
-from lae_sim.engine import Call, Policy
+from lae_sim.engine import Call, Ints, Policy
+
+
+class LanePolicy(Protocol):
+    """A policy that can also choose for many sequences at once (:mod:`lae_sim.batch`).
+
+    Its frames start at once, or at their arrival if that is still to come.
+    """
+
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        """The frame to process next and the tick to start it."""
+
+    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
+        """The frame of each lane, from its last one and the tick when that was ready.
+
+        All are int64 [lanes]. A lane that has ended may be asked about, whatever the answer.
+        """
 
 
 def _start(clock: Clock, now: int, frame: int) -> tuple[int, int]:
@@ -19,43 +40,70 @@ def _start(clock: Clock, now: int, frame: int) -> tuple[int, int]:
     return frame, now if now > arrival else arrival
 
 
-def latest(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
-    """The newest frame that has arrived, or the next to arrive (PVT 2021, Eqs. 3-4)."""
-    last, _, now = calls[-1]
-    newest = now // clock.frame_ticks
-    if newest > last:
-        return newest, now
-    return last + 1, (last + 1) * clock.frame_ticks
-
-
-def fifo(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
-    """Every frame in order; frames queue while the tracker is busy."""
-    last, _, now = calls[-1]
-    return _start(clock, now, last + 1)
-
-
-def every(n: int) -> Policy:
-    """Every ``n``-th frame in order, a fixed stride; they queue if the tracker is slower."""
-
-    def fixed_stride(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+@dataclass(frozen=True)
+class _Latest:
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         last, _, now = calls[-1]
-        return _start(clock, now, last + n)
+        newest = now // clock.frame_ticks
+        if newest > last:
+            return newest, now
+        return last + 1, (last + 1) * clock.frame_ticks
 
-    return fixed_stride
-
-
-def listed(frames: Sequence[int]) -> Policy:
-    """These frames in order; they queue if the tracker is slower."""
-
-    def next_listed(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
-        _, _, now = calls[-1]
-        beyond = len(calls) >= len(frames)
-        return _start(clock, now, frames[-1] + 2**40 if beyond else frames[len(calls)])
-
-    return next_listed
+    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
+        following: Ints = np.maximum(now // clock.frame_ticks, last + 1)
+        return following
 
 
-def shrinking_tail(expected_ns: int) -> Policy:
+@dataclass(frozen=True)
+class _Every:
+    n: int
+
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        last, _, now = calls[-1]
+        return _start(clock, now, last + self.n)
+
+    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
+        return last + min(self.n, _BEYOND)
+
+
+@dataclass(frozen=True)
+class _ShrinkingTail:
+    expected_ns: int
+
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        last, _, now = calls[-1]
+        interval = clock.frame_ticks
+        newest = now // interval
+        expected = self.expected_ns * clock.ticks_per_ns
+        waits = expected > interval and (now + expected) % interval < now % interval
+        return _start(clock, now, newest + 1 if waits else max(newest, last + 1))
+
+    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
+        interval = clock.frame_ticks
+        newest = now // interval
+        following: Ints = np.maximum(newest, last + 1)
+        expected = self.expected_ns * clock.ticks_per_ns
+        if expected > interval:  # tails shrink where adding the expected one reaches an arrival
+            waits = now - newest * interval >= interval - expected % interval
+            following = np.where(waits, newest + 1, following)
+        return following
+
+
+_BEYOND = 2**40  # no sequence has so many frames
+
+latest: LanePolicy = _Latest()
+"""The newest frame that has arrived, or the next to arrive (PVT 2021, Eqs. 3-4)."""
+
+fifo: LanePolicy = _Every(1)
+"""Every frame in order; frames queue while the tracker is busy."""
+
+
+def every(n: int) -> LanePolicy:
+    """Every ``n``-th frame in order, a fixed stride; they queue if the tracker is slower."""
+    return _Every(n)
+
+
+def shrinking_tail(expected_ns: int) -> LanePolicy:
     """The newest frame, or the next one if waiting for it lowers the expected tail.
 
     Li, Wang and Ramanan, "Towards Streaming Perception" (2020), Alg. 1: with the tail
@@ -65,16 +113,18 @@ def shrinking_tail(expected_ns: int) -> Policy:
     Args:
         expected_ns: the expected processing time r, ns.
     """
+    return _ShrinkingTail(expected_ns)
 
-    def wait_if_the_tail_shrinks(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
-        last, _, now = calls[-1]
-        interval = clock.frame_ticks
-        newest = now // interval
-        expected = expected_ns * clock.ticks_per_ns
-        waits = expected > interval and (now + expected) % interval < now % interval
-        return _start(clock, now, newest + 1 if waits else max(newest, last + 1))
 
-    return wait_if_the_tail_shrinks
+def listed(frames: Sequence[int]) -> Policy:
+    """These frames in order; they queue if the tracker is slower."""
+
+    def next_listed(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        _, _, now = calls[-1]
+        beyond = len(calls) >= len(frames)
+        return _start(clock, now, frames[-1] + _BEYOND if beyond else frames[len(calls)])
+
+    return next_listed
 
 
 def vot_realtime(grace: int = 3) -> Policy:

@@ -1,4 +1,4 @@
-"""Replaying one recording: the engine fed with recorded times and boxes."""
+"""Replaying recordings: the engine fed with recorded times and boxes."""
 
 from __future__ import annotations
 
@@ -8,15 +8,19 @@ from fractions import Fraction
 
 import numpy as np
 
+from lae_sim.batch import simulate_lanes
 from lae_sim.boxes import PARTED_IOU, Floats, iou
 from lae_sim.clock import Clock
-from lae_sim.engine import Ints, Policy, Schedule, simulate
+from lae_sim.engine import Ints, Policy, Schedule, Service, simulate
 from lae_sim.errors import LaeError
-from lae_sim.latency import LatencySource, by_frame
+from lae_sim.latency import LatencySource, RandomSource, Times, by_frame
 from lae_sim.policies import latest
 from lae_sim.recording import Recording
 from lae_sim.strides import followed
-from lae_sim.trace import Trace
+from lae_sim.trace import Trace, batched
+
+_GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
+_LANE_FRAMES = 1 << 22  # and of their repetitions
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,20 +76,36 @@ def replay_sequence(
         LaeError: if a frame is asked for that the recording lacks, or the recordings differ in
             length; it names the sequence and the frame.
     """
-    for other in [*([] if times is None else [times]), *(strided or {}).values()]:
-        if len(other) != len(recording):
-            raise LaeError(
-                f"sequence {recording.name!r} has {len(recording)} frames in one trace and "
-                f"{len(other)} in another"
-            )
-    schedule = simulate(
-        len(recording), clock, source(recording if times is None else times), policy
-    )
-    frames = schedule.frames
-    if strided:
-        return _from_passes(recording, {stride: recording, **strided}, schedule)
-    boxes = _boxes(recording, frames)
-    return Run(recording, schedule, boxes, _departures(recording, frames, stride))
+    job = _Job(recording, recording if times is None else times, strided or {}, stride)
+    return job.run(simulate(len(recording), clock, source(job.times), policy))
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A recording with what its replay needs besides: times, passes at other strides, its own."""
+
+    recording: Recording
+    times: Recording
+    passes: Mapping[Fraction, Recording]
+    stride: Fraction
+
+    def __post_init__(self) -> None:
+        for other in (self.times, *self.passes.values()):
+            if len(other) != len(self.recording):
+                raise LaeError(
+                    f"sequence {self.recording.name!r} has {len(self.recording)} frames in one "
+                    f"trace and {len(other)} in another"
+                )
+
+    def __len__(self) -> int:
+        return len(self.recording)
+
+    def run(self, schedule: Schedule) -> Run:
+        recording, frames = self.recording, schedule.frames
+        if self.passes:
+            return _from_passes(recording, {self.stride: recording, **self.passes}, schedule)
+        boxes = _boxes(recording, frames)
+        return Run(recording, schedule, boxes, _departures(recording, frames, self.stride))
 
 
 def _boxes(recording: Recording, frames: Ints) -> Floats:
@@ -134,6 +154,7 @@ def replay_trace(
     policy: Policy = latest,
     timing: Trace | None = None,
     strided: Sequence[Trace] = (),
+    batch: bool = False,
 ) -> Iterator[Run]:
     """Replay every sequence of a trace, one after another.
 
@@ -144,11 +165,69 @@ def replay_trace(
         policy: which frame is processed next.
         timing: another device's trace to take the times from; it must have the same sequences.
         strided: traces of the same tracker at other strides (see :func:`replay_sequence`).
+        batch: schedule many sequences at once where source and policy allow it (see
+            :func:`lae_sim.batch.batchable`). The runs are the same, and come in groups.
 
     Raises:
         LaeError: if a sequence or frame that is asked for is not there.
     """
     clock = Clock.at(trace.metadata.fps if fps is None else fps)
+    for jobs in batched(_jobs(trace, timing, strided), _GROUP_FRAMES if batch else 1):
+        yield from _replayed(jobs, clock, [source(job.times) for job in jobs], policy)
+
+
+def replay_repeated(
+    trace: Trace,
+    source: RandomSource,
+    count: int,
+    fps: Fraction | None = None,
+    policy: Policy = latest,
+    timing: Trace | None = None,
+    first: int = 0,
+) -> Iterator[tuple[int, Run]]:
+    """Replay a trace again and again, under other random times in each repetition.
+
+    Args:
+        trace: the boxes and the truth.
+        source: draws the times; its own repetition does not count.
+        count: number of repetitions.
+        fps: world frame rate; the trace's own by default.
+        policy: which frame is processed next.
+        timing: another device's trace to take the times from.
+        first: the first repetition.
+
+    Yields:
+        The repetition and the run, which is that of :func:`replay_trace` with the source in that
+        repetition. Sequences come in groups; in a group, repetition after repetition, and in a
+        repetition sequence after sequence.
+
+    Raises:
+        LaeError: if a sequence or frame that is asked for is not there.
+    """
+    clock = Clock.at(trace.metadata.fps if fps is None else fps)
+    for jobs in batched(_jobs(trace, timing), _GROUP_FRAMES):
+        size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
+        for begin in range(first, first + count, size):
+            some = range(begin, min(begin + size, first + count))
+            drawn = [source.repeated(job.times, begin, len(some)) for job in jobs]
+            times = [
+                Times(job.recording.name, rows[k], by_call=True)
+                for k in range(len(some))
+                for job, rows in zip(jobs, drawn)
+            ]
+            runs = _replayed(jobs * len(some), clock, times, policy)
+            yield from ((r, next(runs)) for r in some for _ in jobs)
+
+
+def _replayed(
+    jobs: Sequence[_Job], clock: Clock, services: Sequence[Service], policy: Policy
+) -> Iterator[Run]:
+    schedules = simulate_lanes([len(job) for job in jobs], clock, services, policy)
+    return (job.run(schedule) for job, schedule in zip(jobs, schedules))
+
+
+def _jobs(trace: Trace, timing: Trace | None, strided: Sequence[Trace] = ()) -> Iterator[_Job]:
+    """Each recording of a trace with those of the same name in other traces."""
     times = None if timing is None else _finder(timing, "the trace of the times")
     passes = {
         other.metadata.stride: _finder(other, f"the pass of stride {other.metadata.stride}")
@@ -158,14 +237,11 @@ def replay_trace(
     if stride in passes or len(passes) != len(strided):
         raise LaeError("two of the passes have the same stride: give each stride once")
     for recording in trace:
-        yield replay_sequence(
+        yield _Job(
             recording,
-            clock,
-            source,
-            policy,
-            None if times is None else times(recording.name),
-            stride,
+            recording if times is None else times(recording.name),
             {other: find(recording.name) for other, find in passes.items()},
+            stride,
         )
 
 

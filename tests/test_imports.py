@@ -29,7 +29,7 @@ LAYERS = [
     {"clock", "boxes"},
     {"engine"},
     {"policies", "recording", "strides"},
-    {"latency", "pairing", "kalman", "forecast", "metrics", "arrow", "metadata", "files", "locate"},
+    {"latency", "batch", "pairing", "kalman", "forecast", "metrics", "arrow", "metadata", "files", "locate"},
     {"rows", "checks"},
     {"trace"},
     {"run"},

@@ -29,13 +29,15 @@ TIMES = [90, -1, 20, 30, -1, 50]
 RECORDED = [90, 20, 30, 50]
 
 
-def recording(times: list[int], name: str = "a") -> Recording:
+def recording(times: list[int], name: str = "a", length: int = 0) -> Recording:
+    """A sequence with these times, and more frames without any up to a length."""
+    times = times + [-1] * (length - len(times))
     boxes = np.where(np.array(times)[:, None] < 0, np.nan, np.ones((1, 4)))
     return Recording.new(name, np.ones((len(times), 4)), boxes, times)
 
 
 def draws(source: LatencySource, count: int, of: Recording | None = None) -> list[int]:
-    service = source(recording(TIMES) if of is None else of)
+    service = source(recording(TIMES, length=count) if of is None else of)
     return [service(frame) for frame in range(count)]
 
 
@@ -119,24 +121,25 @@ def test_resampled_draws_every_recorded_time_but_that_of_the_initialisation() ->
 
 def test_lognormal_has_the_moments_of_the_recorded_logarithms() -> None:
     times = [10**9] + np.random.default_rng(0).lognormal(17, 0.3, 400).astype(int).tolist()
-    logs = np.log(draws(lognormal(5), 4001, recording(times))[1:])
+    logs = np.log(draws(lognormal(5), 4001, recording(times, length=4001))[1:])
     recorded = np.log(times[1:])
     assert statistics.fmean(logs) == pytest.approx(recorded.mean(), abs=0.02)
     assert statistics.pstdev(logs) == pytest.approx(recorded.std(), abs=0.02)
 
 
 def test_lognormal_of_equal_times_is_that_time() -> None:
-    assert set(draws(lognormal(1), 50, recording([47_000_000] * 9))) == {47_000_000}
+    assert set(draws(lognormal(1), 50, recording([47_000_000] * 50))) == {47_000_000}
 
 
 @RANDOM
 def test_a_sequence_of_one_frame_can_be_drawn_from(make: Make) -> None:
-    assert draws(make(1), 4, recording([47])) == [47] * 4
+    assert draws(make(1), 4, recording([47], length=4)) == [47] * 4
+    assert draws(make(1), 1, recording([47])) == [47]
 
 
 @RANDOM
 def test_times_of_zero_can_be_drawn_from(make: Make) -> None:
-    assert set(draws(make(1), 20, recording([0, 0, 0]))) <= {0, 1}
+    assert set(draws(make(1), 20, recording([0] * 20))) <= {0, 1}
 
 
 @RANDOM
@@ -149,12 +152,12 @@ def test_another_seed_or_name_draws_something_else(make: Make) -> None:
     first = draws(make(7), 200)
     assert draws(make(8), 200) != first
     assert draws(make(-7), 200) != first
-    assert draws(make(7), 200, recording(TIMES, "b")) != first
+    assert draws(make(7), 200, recording(TIMES, "b", 200)) != first
 
 
 @RANDOM
 def test_names_and_seeds_do_not_run_together(make: Make) -> None:
-    one, other = recording(TIMES, "1a"), recording(TIMES, "a")
+    one, other = recording(TIMES, "1a", 200), recording(TIMES, "a", 200)
     assert draws(make(1), 200, other) != draws(make(11), 200, other)
     assert draws(make(1), 200, one) != draws(make(11), 200, other)
 
@@ -163,8 +166,8 @@ def test_names_and_seeds_do_not_run_together(make: Make) -> None:
 @given(st.permutations(["a", "b", "c"]), st.integers(0, 3))
 def test_other_sequences_change_nothing(make: Make, names: list[str], used: int) -> None:
     source = make(3)
-    alone = {name: draws(make(3), 40, recording(TIMES, name)) for name in "abc"}
-    services = {name: source(recording(TIMES, name)) for name in names[:used]}
+    alone = {name: draws(make(3), 40, recording(TIMES, name, 40)) for name in "abc"}
+    services = {name: source(recording(TIMES, name, 40)) for name in names[:used]}
     found: dict[str, list[int]] = {name: [] for name in services}
     for frame in range(40):  # interleaved, in any order
         for name, service in services.items():
@@ -177,7 +180,7 @@ GOLDEN_TIMES = [90_000_000, 41_000_000, 52_000_000, 47_000_000, 39_500_000]
 
 def test_the_streams_of_a_seed_never_change() -> None:
     # If this fails, every published result with a seed has changed: do not update the numbers.
-    golden = recording(GOLDEN_TIMES, "Gull2")
+    golden = recording(GOLDEN_TIMES, "Gull2", 9)
     assert draws(resampled(1), 9, golden) == RESAMPLED
     assert draws(lognormal(1), 9, golden) == pytest.approx(LOGNORMAL, abs=1)
 
