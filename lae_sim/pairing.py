@@ -25,6 +25,7 @@ SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
 
 MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
 _NEVER = 2**62
+_WIDE = 8  # from so many sigmas on, reduceat is slower than a loop over the sequences
 Frames = npt.NDArray[np.int32]
 
 
@@ -61,9 +62,12 @@ class Pairing:
     @property
     def mismatch_sum(self) -> Ints:
         """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""
-        source_sum = np.add.reduceat(
-            (self.end - self.first) * self.frames[:, None], self.offsets[:-1]
-        )
+        answered = self.end - self.first
+        if len(self.sigmas) < _WIDE:
+            source_sum = np.add.reduceat(answered * self.frames[:, None], self.offsets[:-1])
+        else:
+            spans = map(slice, self.offsets[:-1], self.offsets[1:])
+            source_sum = np.stack([self.frames[span] @ answered[span] for span in spans])
         return (self.lengths * (self.lengths - 1) // 2)[:, None] - source_sum
 
     @property
@@ -72,12 +76,19 @@ class Pairing:
         # An output that answers nothing cannot have the maximum: the query before its turn was
         # answered by an older one.
         late = self.end - (self.frames + 1).astype(np.int32)[:, None]
-        return np.maximum.reduceat(late, self.offsets[:-1]).astype(np.int64)
+        return self._largest(late)
 
     @property
     def longest_hold(self) -> Ints:
         """Most queries in a row that one output answered, frames, int64 [S, M]."""
-        return np.maximum.reduceat(self.end - self.first, self.offsets[:-1]).astype(np.int64)
+        return self._largest(self.end - self.first)
+
+    def _largest(self, values: Frames) -> Ints:
+        """The largest value of each sequence, int64 [S, M]."""
+        if len(self.sigmas) < _WIDE:
+            return np.maximum.reduceat(values, self.offsets[:-1]).astype(np.int64)
+        spans = map(slice, self.offsets[:-1], self.offsets[1:])
+        return np.stack([values[span].max(axis=0) for span in spans]).astype(np.int64)
 
 
 def pair(
