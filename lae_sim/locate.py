@@ -14,7 +14,7 @@ from typing import Any
 
 from lae_sim.errors import LaeError, TraceError
 
-BLOCK = 1 << 20
+BLOCK = 8 << 20  # bytes read at once; s3fs would take 50 MiB, several times over
 
 
 def find_traces(patterns: Sequence[str], base: Path | None = None) -> list[str]:
@@ -106,7 +106,7 @@ def _remote(pattern: str) -> list[str]:
 
 def _binary(url: str) -> Any:
     system, path = _file_system(url)
-    file = system.open(path, "rb")
+    file = system.open(path, "rb", block_size=BLOCK)
     if path.startswith("http"):
         try:
             file.seek(-1, os.SEEK_END)
@@ -122,7 +122,7 @@ def _binary(url: str) -> Any:
 
 
 def _file_system(url: str) -> tuple[Any, str]:
-    from fsspec.core import url_to_fs  # type: ignore[import-untyped]  # it has no types
+    from fsspec.core import url_to_fs
 
     system, path = url_to_fs(url)
     system.invalidate_cache()  # a listing from before would hide that a file has changed

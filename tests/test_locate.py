@@ -137,7 +137,7 @@ def test_a_url_without_fsspec_tells_what_to_install(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_digest_is_of_the_content(folder: Path, memory: Any) -> None:
-    content = os.urandom(3 << 20)
+    content = os.urandom(9 << 20)
     (folder / "a.parquet").write_bytes(content)
     memory.pipe("/lae/a.parquet", content)
     wanted = hashlib.sha256(content).hexdigest()
