@@ -17,11 +17,16 @@ from typing import Any
 import numpy as np
 
 from lae_sim import __version__
+from lae_sim.arrow import from_numpy
+from lae_sim.batch import batchable
 from lae_sim.evaluation import Evaluation, evaluate_groups
 from lae_sim.forecast import AnyFactory
+from lae_sim.latency import LatencySource, RandomSource, bootstrap, scaled
 from lae_sim.metrics import METRICS, find_convention
 from lae_sim.notes import notes_on
-from lae_sim.run import Run
+from lae_sim.options import parse_latency, parse_policy
+from lae_sim.run import Run, replay_repeated, replay_trace
+from lae_sim.study_file import RANDOM
 from lae_sim.trace import read_trace
 
 VERSION = 1
@@ -315,8 +320,6 @@ class _Rows:
         """Add a row for each sequence of a part and each sigma."""
         import pyarrow as pa
 
-        from lae_sim.arrow import from_numpy
-
         count = len(self._sigmas)
         calls = np.maximum(part.processed - 1, 1)
         once = {  # by sequence
@@ -360,7 +363,7 @@ class Replayed:
 
     Attributes:
         runs: repetition and run, as they are made.
-        engine: ``"batch"``, or ``"simpy"`` where the policy or the latency knows no lanes.
+        engine: ``"batch"``, or ``"simpy"`` where the policy or the source of times knows no lanes.
     """
 
     runs: Iterable[tuple[int, Run]]
@@ -368,22 +371,23 @@ class Replayed:
 
 
 def replayed(setting: Setting) -> Replayed:
-    """Replay a setting."""
-    from lae_sim.latency import scaled
-    from lae_sim.options import parse_latency, parse_policy
-    from lae_sim.run import replay_trace
-
+    """Replay a setting: its sequences and repetitions at once, where that is possible."""
     trace = read_trace(setting.trace.path, setting.sequences or None)
     timing = None if setting.timing is None else read_trace(setting.timing.path)
     policy, _ = parse_policy(setting.policy)
+    source = scaled(_source(setting), setting.scale)
+    times = source(next(iter(timing or trace)))
+    engine = "batch" if batchable([times], policy) else "simpy"
+    if isinstance(source, RandomSource):
+        where = (source, setting.count, setting.fps, policy, timing, setting.first)
+        return Replayed(replay_repeated(trace, *where), engine)
+    runs = replay_trace(trace, setting.fps, source, policy, timing, batch=True)
+    return Replayed(((0, run) for run in runs), engine)
 
-    def runs() -> Iterator[tuple[int, Run]]:
-        for repetition in range(setting.first, setting.first + setting.count):
-            named = setting.latency + (
-                f":{setting.seed}" if setting.block or setting.count > 1 else ""
-            )
-            source = scaled(parse_latency(named), setting.scale)
-            for run in replay_trace(trace, setting.fps, source, policy, timing):
-                yield repetition, run
 
-    return Replayed(runs(), "simpy")
+def _source(setting: Setting) -> LatencySource:
+    if setting.latency == "bootstrap":
+        return bootstrap(setting.seed, setting.block)
+    if setting.latency in RANDOM:
+        return parse_latency(f"{setting.latency}:{setting.seed}")
+    return parse_latency(setting.latency)
