@@ -16,18 +16,25 @@ if TYPE_CHECKING:
     from lae_sim.latency import LatencySource
 
 
-def add_world(parser: argparse.ArgumentParser) -> None:
-    """Add what decides a replay: the frame rate, the policy and the processing times."""
-    add = _world_group(parser)
+def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
+    """Add what decides a replay: the frame rate, the policy and the processing times.
+
+    Args:
+        parser: the command line.
+        sweeps: whether the rate and the scale of the times may be several: they are lists then,
+            that of the rates empty unless they are given.
+    """
+    add = _world_group(parser, sweeps)
     add(
         "--latency", default="recorded", help="where processing times come from (default: recorded)"
     )
     add(
         "--latency-scale",
         type=argument(parse_rational),
-        default=Fraction(1),
         metavar="FACTOR",
-        help="multiply all times by an exact factor, such as 2 or 1/3",
+        **({"nargs": "+", "default": [Fraction(1)]} if sweeps else {"default": Fraction(1)}),
+        help="multiply all times by an exact factor, such as 2 or 1/3"
+        + (", or by several, one after another" if sweeps else ""),
     )
     add("--timing", metavar="TRACE", help="take the times from another device's trace")
     add(
@@ -66,10 +73,22 @@ def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> N
     )
 
 
-def _world_group(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
+def _world_group(
+    parser: argparse.ArgumentParser, sweeps: bool = False
+) -> Callable[..., argparse.Action]:
     """A group of options that begins with the world's rate and the policy; what adds to it."""
-    add = parser.add_argument_group("the world and the tracker").add_argument
-    add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the trace's)")
+    group = parser.add_argument_group("the world and the tracker")
+    add: Callable[..., argparse.Action] = group.add_argument
+    several = (
+        "; several are a sweep of how fast the world moves, since the motion from one recorded "
+        "frame to the next stays what it is"
+    )
+    add(
+        "--fps",
+        type=argument(parse_fps),
+        **({"nargs": "+", "default": []} if sweeps else {}),
+        help="world frame rate, exact (default: the trace's)" + (several if sweeps else ""),
+    )
     add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
     return add
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -14,26 +13,24 @@ from lae_sim.cli import argument, exit_status, new_parser
 from lae_sim.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, labels
-from lae_sim.options import add_forecasting, add_world, parse_latency, parse_policy
-from lae_sim.zoo import FORECASTERS, find_camera, load_forecaster
+from lae_sim.jobs import Job, jobs_of, report
+from lae_sim.options import add_forecasting, add_world
+from lae_sim.zoo import FORECASTERS
 
 if TYPE_CHECKING:
-    from lae_sim.clock import Clock
-    from lae_sim.forecast import AnyFactory
-    from lae_sim.metrics import Convention
     from lae_sim.report import Report
     from lae_sim.run import Run
-    from lae_sim.trace import Trace
 
 PROGRAM = "lae-sim replay"
 
-_SINGLE = ("outputs", "schedule", "events", "timeline")  # files of one trace in one world
+_FILES = ("outputs", "schedule", "events", "timeline")  # each of one trace in one world
 
 EXAMPLES = f"""\
 examples:
   lae-sim replay trace.parquet
   lae-sim replay trace.parquet --latency constant:47ms --forecaster hold kalman --sigma-grid
   lae-sim replay desktop.parquet --timing jetson.parquet      boxes of one device, times of another
+  lae-sim replay trace.parquet --fps 15 30 60 --latency-scale 1/2 1 2 --plot sweep.png
   lae-sim replay a.parquet b.parquet --latency-scale 2 --json | jq '.traces[].results[].auc'
   lae-sim replay trace.parquet --forecaster my_package.my_module:MyForecaster --per-sequence
 
@@ -54,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")
-    add_world(made)
+    add_world(made, sweeps=True)
     scores = made.add_argument_group("forecasting and scores")
     add = scores.add_argument
     add(
@@ -100,7 +97,7 @@ def parser() -> argparse.ArgumentParser:
         "picture of the first sequence",
     )
     add("--export-txt", metavar="DIR", help="write result text files for the pysot toolkit")
-    add("--plot", metavar="FILE", help="draw success and precision (.png, .svg, .pdf)")
+    add("--plot", metavar="FILE", help="draw success and precision, or a sweep (.png, .svg, .pdf)")
     return made
 
 
@@ -116,165 +113,49 @@ def _replay(arguments: argparse.Namespace) -> None:
     from lae_sim import __version__
     from lae_sim.pairing import SIGMA_GRID
 
-    single = [name for name in _SINGLE if getattr(arguments, name)]
-    if single and len(arguments.traces) > 1:
-        raise LaeError(f"--{single[0]} takes one trace at a time")
     if arguments.eta is not None:
         arguments.sigma = [-eta for eta in arguments.eta]
-    arguments.sigma = list(dict.fromkeys(arguments.sigma))
-    arguments.forecaster = list(dict.fromkeys(arguments.forecaster))
-    arguments.traces = list(dict.fromkeys(arguments.traces))
-    outputs = [*(getattr(arguments, name) for name in _SINGLE), arguments.plot]
-    if arguments.strided and len(arguments.traces) > 1:
-        raise LaeError("--strided goes with one trace at a time")
-    timing = [arguments.timing] if arguments.timing else []
-    inputs = [*arguments.traces, *timing, *arguments.strided]
-    check_distinct([path for path in outputs if path], inputs)
+    for name in ("sigma", "forecaster", "traces", "fps", "latency_scale"):
+        setattr(arguments, name, list(dict.fromkeys(getattr(arguments, name))))
+    swept = [name for name in ("fps", "latency_scale") if len(getattr(arguments, name)) > 1]
+    _check_files(arguments, swept)
     shown = sorted({float(sigma) for sigma in arguments.sigma})
     sigmas = sorted({*arguments.sigma, *(SIGMA_GRID if arguments.sigma_grid else ())})
-    jobs = [
-        _Job.of(path, label, arguments, sigmas)
-        for path, label in zip(arguments.traces, labels(arguments.traces))
-    ]
+    named = zip(arguments.traces, labels(arguments.traces))
+    jobs = [job for path, label in named for job in jobs_of(path, label, arguments, sigmas)]
     if arguments.plot:
         from lae_sim.plots import check_format
 
         check_format(arguments.plot)
     with ExitStack() as files:  # whatever fails, no file is left behind
-        reports = [_report(job, _sinks(job, arguments, files), arguments) for job in jobs]
+        reports = [report(job, _sinks(job, arguments, files), arguments) for job in jobs]
         if arguments.plot:
-            _plot(jobs, arguments.sigma[0], arguments.plot)
+            _plot(jobs, reports, swept, arguments)
     if arguments.json:
         document = {"format": "lae-replay", "version": "1.0", "lae_sim": __version__}
         print(json.dumps({**document, "traces": reports}, indent=2, allow_nan=False))
     else:
-        _print_tables(reports, shown, arguments)
+        _print_tables(jobs, reports, shown, swept, arguments)
 
 
-@dataclass(frozen=True)
-class _Job:
-    """One trace and how it is replayed and scored.
-
-    Attributes:
-        path: the trace's file.
-        label: its name in tables and pictures.
-        trace: the trace.
-        timing: the trace that the times come from, if it is another.
-        clock: the world's clock.
-        runs: replays the sequences, from the first, each time it is called.
-        at_arrival: whether outputs count from their own frames' arrival.
-        forecasters: factories by name; hold, the baseline of all comparisons, is always there.
-        costs: what an answer of each forecaster costs, ns.
-        sigmas: permitted latencies, ascending.
-        convention: how frames and thresholds count.
-    """
-
-    path: str
-    label: str
-    trace: Trace
-    timing: Trace | None
-    clock: Clock
-    runs: Callable[[], Iterator[Run]]
-    at_arrival: bool
-    forecasters: Mapping[str, AnyFactory]
-    costs: Mapping[str, int]
-    sigmas: Sequence[Fraction]
-    convention: Convention
-
-    @classmethod
-    def of(
-        cls, path: str, label: str, arguments: argparse.Namespace, sigmas: Sequence[Fraction]
-    ) -> _Job:
-        from lae_sim.clock import Clock
-        from lae_sim.costs import resolve_costs
-        from lae_sim.latency import scaled
-        from lae_sim.metrics import find_convention
-        from lae_sim.run import replay_trace
-        from lae_sim.trace import read_trace
-
-        policy, at_arrival = parse_policy(arguments.policy)
-        if at_arrival and any(sigmas):
-            raise LaeError("vot-realtime never scores latency: it goes with no permitted latency")
-        if at_arrival and arguments.cost:
-            raise LaeError("vot-realtime never scores latency: it goes with no --cost")
-        if at_arrival and arguments.timeline:
-            raise LaeError("vot-realtime never scores latency: it goes with no --timeline")
-        source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
-        trace = read_trace(path, arguments.sequence)
-        timing = read_trace(arguments.timing) if arguments.timing else None
-        strided = [read_trace(pass_, arguments.sequence) for pass_ in arguments.strided]
-        if arguments.attributes and not trace.metadata.names_attributes:
-            raise LaeError(f"{path}: the trace names no attributes of its sequences")
-        fps = arguments.fps or trace.metadata.fps
-        camera = find_camera(
-            arguments.root, arguments.dataset, arguments.sequence, fps, arguments.camera_lag
-        )
-        names = dict.fromkeys(["hold", *arguments.forecaster])
-        forecasters = {name: load_forecaster(name, camera) for name in names}
-        return cls(
-            path=path,
-            label=label,
-            trace=trace,
-            timing=timing,
-            clock=Clock.at(fps),
-            runs=lambda: replay_trace(trace, fps, source, policy, timing, strided),
-            at_arrival=at_arrival,
-            forecasters=forecasters,
-            costs=resolve_costs(arguments.cost, forecasters, trace),
-            sigmas=sigmas,
-            convention=find_convention(arguments.convention),
-        )
-
-
-def _report(
-    job: _Job, sinks: Sequence[Callable[[Run], None]], arguments: argparse.Namespace
-) -> Report:
-    """Replay and score one trace, giving each run to the sinks."""
-    from lae_sim.costs import cost_notes
-    from lae_sim.evaluation import evaluate
-    from lae_sim.notes import SkippedStalls, notes_on
-    from lae_sim.report import attribute_members, trace_report
-
-    metadata = job.trace.metadata
-    stalls = SkippedStalls()
-    if arguments.latency == "recorded" and job.timing is None:
-        sinks = [*sinks, stalls]
-    runs = _written(_progress(job.runs(), job.path, job.trace.frames), sinks)
-    evaluation = evaluate(
-        runs, metadata, job.forecasters, job.sigmas, job.convention, job.at_arrival, job.costs
-    )
-    members = attribute_members(metadata, evaluation.sequences)
-    notes = notes_on(evaluation, metadata, job.convention, job.forecasters, job.at_arrival)
-    figures = trace_report(
-        evaluation,
-        job.clock,
-        list(job.forecasters),
-        job.sigmas,
-        job.convention.name,
-        members if arguments.attributes else None,
-        arguments.per_sequence,
-    )
-    return {
-        "trace": job.path,
-        "tracker": metadata.tracker,
-        "dataset": metadata.dataset,
-        "device": metadata.device,
-        "strided": arguments.strided,
-        "times_from": arguments.timing or job.path,
-        "times_note": (job.timing or job.trace).metadata.timing_note,
-        "fps": str(job.clock.fps),
-        "policy": arguments.policy,
-        "latency": arguments.latency,
-        "latency_scale": str(arguments.latency_scale),
-        "convention": job.convention.name,
-        "forecaster_cost_ns": dict(job.costs),
-        "notes": [*notes, *stalls.notes(), *cost_notes(job.costs)],
-        **figures,
-    }
+def _check_files(arguments: argparse.Namespace, swept: Sequence[str]) -> None:
+    """Check that the files asked for can hold what is asked for, and replace nothing that is."""
+    asked = [name for name in _FILES if getattr(arguments, name)]
+    if asked and len(arguments.traces) > 1:
+        raise LaeError(f"--{asked[0]} takes one trace at a time")
+    asked += ["export-txt"] if arguments.export_txt else []
+    if asked and swept:
+        raise LaeError(f"--{asked[0]} takes one frame rate and one scale of the times at a time")
+    if arguments.strided and len(arguments.traces) > 1:
+        raise LaeError("--strided goes with one trace at a time")
+    outputs = [*(getattr(arguments, name) for name in _FILES), arguments.plot]
+    timing = [arguments.timing] if arguments.timing else []
+    inputs = [*arguments.traces, *timing, *arguments.strided]
+    check_distinct([path for path in outputs if path], inputs)
 
 
 def _sinks(
-    job: _Job, arguments: argparse.Namespace, files: ExitStack
+    job: Job, arguments: argparse.Namespace, files: ExitStack
 ) -> list[Callable[[Run], None]]:
     """Open the files that were asked for; what each does with a run."""
     from pathlib import Path
@@ -316,31 +197,27 @@ def _sinks(
     return [*sinks, answer] if answer_sinks else sinks
 
 
-def _written(runs: Iterable[Run], sinks: Sequence[Callable[[Run], None]]) -> Iterator[Run]:
-    """The runs, each given to every sink as it passes."""
-    for run in runs:
-        for sink in sinks:
-            sink(run)
-        yield run
-
-
-def _progress(runs: Iterable[Run], path: str, frames: int | None) -> Iterator[Run]:
-    """The runs, with a progress bar if the standard error stream is a terminal."""
-    from tqdm import tqdm
-
-    with tqdm(total=frames, desc=path, unit=" frames", unit_scale=True, disable=None) as bar:
-        for run in runs:
-            yield run
-            bar.update(len(run))
-
-
-def _plot(jobs: Sequence[_Job], sigma: Fraction, path: str) -> None:
-    """Draw success and precision of all traces."""
+def _plot(
+    jobs: Sequence[Job],
+    reports: Sequence[Report],
+    swept: Sequence[str],
+    arguments: argparse.Namespace,
+) -> None:
+    """Draw success and precision of all traces, or how AUC and DP change over a sweep."""
     from pathlib import Path
 
     from lae_sim import plots
     from lae_sim.export import sigma_text
 
+    sigma, several = arguments.sigma[0], len(arguments.traces) > 1
+    title = "" if several else f"{jobs[0].label}: "
+    title += f"sigma {sigma_text(sigma)}, convention {jobs[0].convention.name}"
+    if swept:
+        from lae_sim.sweep import sweep_figure
+
+        names = [job.label for job in jobs]
+        plots.save(sweep_figure(reports, names, float(sigma), swept, title), arguments.plot)
+        return
     named: plots.Curves = {}
     for job in jobs:
         found = plots.curves(
@@ -352,26 +229,33 @@ def _plot(jobs: Sequence[_Job], sigma: Fraction, path: str) -> None:
             job.at_arrival,
             job.costs,
         )
-        prefix = f"{Path(job.label).with_suffix('')}: " if len(jobs) > 1 else ""
+        prefix = f"{Path(job.label).with_suffix('')}: " if several else ""
         named.update({prefix + name: curve for name, curve in found.items()})
-    title = "" if len(jobs) > 1 else f"{jobs[0].label}: "
-    title += f"sigma {sigma_text(sigma)}, convention {jobs[0].convention.name}"
-    plots.save(plots.success_and_precision(named, title), path)
+    plots.save(plots.success_and_precision(named, title), arguments.plot)
 
 
 def _print_tables(
-    reports: Sequence[Report], shown: Sequence[float], arguments: argparse.Namespace
+    jobs: Sequence[Job],
+    reports: Sequence[Report],
+    shown: Sequence[float],
+    swept: Sequence[str],
+    arguments: argparse.Namespace,
 ) -> None:
     from lae_sim.report import attribute_table, sequence_table, settings_text, summary_table
 
-    for report in reports:
+    for each in reports:
         if arguments.per_sequence:
-            print(f"{report['trace']}\n\n{sequence_table(report, shown)}\n")
+            print(f"{each['trace']}\n\n{sequence_table(each, shown, swept)}\n")
         if arguments.attributes:
-            print(f"{report['trace']}\n\n{attribute_table(report, shown)}\n")
-    print(summary_table(reports, labels(arguments.traces), shown), end="\n\n")
-    for report in reports:
-        print(settings_text(report))
+            print(f"{each['trace']}\n\n{attribute_table(each, shown, swept)}\n")
+    print(summary_table(reports, [job.label for job in jobs], shown, swept), end="\n\n")
+    for each in reports:
+        print(settings_text(each))
+    if "fps" in swept:
+        print(
+            "a sweep of the rate is one of how fast the world moves: recorded frames arrive "
+            "faster, with the same motion from one to the next"
+        )
 
 
 if __name__ == "__main__":

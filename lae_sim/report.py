@@ -175,12 +175,26 @@ def attribute_members(metadata: Metadata, sequences: Iterable[str]) -> dict[str,
     return dict(sorted(members.items()))
 
 
+SWEPT = {"fps": "fps", "latency_scale": "scale"}
+"""What a sweep can vary, by its name in reports, with the heading of its column."""
+
+
 def summary_table(
-    reports: Sequence[Report], labels: Sequence[str], shown_sigmas: Sequence[float]
+    reports: Sequence[Report],
+    labels: Sequence[str],
+    shown_sigmas: Sequence[float],
+    swept: Sequence[str] = (),
 ) -> str:
-    """One line per trace, which has a label, forecaster and permitted latency."""
+    """One line per report, forecaster and permitted latency.
+
+    Args:
+        reports: of traces, perhaps each in several worlds.
+        labels: the trace's name for each report.
+        shown_sigmas: permitted latencies to show.
+        swept: those of ``SWEPT`` that get a column.
+    """
     grid = any("mauc" in result for report in reports for result in report["results"])
-    header = ["trace", "forecaster"]
+    header = ["trace", "forecaster", *(SWEPT[name] for name in swept)]
     header += ["sigma"] if len(shown_sigmas) > 1 or shown_sigmas != [0.0] else []
     header += ["AUC", "offline", "change", "recov.", "DP@20", "offline", "change", "recov."]
     header += ["mAUC", "mDP"] if grid else []
@@ -190,7 +204,7 @@ def summary_table(
         for result in report["results"]:
             if result["sigma"] not in shown_sigmas:
                 continue
-            line = [label, result["forecaster"]]
+            line = [label, result["forecaster"], *(report[name] for name in swept)]
             line += [f"{result['sigma']:g}"] if "sigma" in header else []
             for metric in ("auc", "dp20"):
                 offline = report["offline"] and report["offline"][metric]
@@ -239,11 +253,15 @@ def settings_text(report: Report) -> str:
     return "\n".join(lines)
 
 
-def attribute_table(report: Report, shown_sigmas: Sequence[float]) -> str:
+def attribute_table(
+    report: Report, shown_sigmas: Sequence[float], swept: Sequence[str] = ()
+) -> str:
     """One line per attribute and forecaster."""
-    header = ["attribute", "forecaster", "sequences", "sigma", "AUC", "recovered", "DP@20"]
+    header = ["attribute", "forecaster", *(SWEPT[name] for name in swept)]
+    header += ["sequences", "sigma", "AUC", "recovered", "DP@20"]
     lines = [
-        [name, result["forecaster"], str(scores["sequences"]), f"{result['sigma']:g}"]
+        [name, result["forecaster"], *(report[name] for name in swept)]
+        + [str(scores["sequences"]), f"{result['sigma']:g}"]
         + [_score(scores["auc"]), _percent(scores["recovered_auc"]), _score(scores["dp20"])]
         for result in _shown(report, shown_sigmas)
         for name, scores in result["attributes"].items()
@@ -251,12 +269,14 @@ def attribute_table(report: Report, shown_sigmas: Sequence[float]) -> str:
     return table(header, sorted(lines, key=lambda line: line[0]))
 
 
-def sequence_table(report: Report, shown_sigmas: Sequence[float]) -> str:
+def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequence[str] = ()) -> str:
     """One line per sequence and forecaster."""
-    header = ["sequence", "forecaster", "sigma", "AUC", "offline", "DP@20", "offline"]
+    header = ["sequence", "forecaster", *(SWEPT[name] for name in swept)]
+    header += ["sigma", "AUC", "offline", "DP@20", "offline"]
     header += ["frames", "processed", "mismatch", "approximate", "disagree"]
     lines = [
-        [one["sequence"], result["forecaster"], f"{result['sigma']:g}"]
+        [one["sequence"], result["forecaster"], *(report[name] for name in swept)]
+        + [f"{result['sigma']:g}"]
         + [_score(one["auc"]), _score(one["offline_auc"])]
         + [_score(one["dp20"]), _score(one["offline_dp20"])]
         + [str(one["world_frames"]), str(one["processed"])]

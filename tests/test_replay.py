@@ -13,6 +13,7 @@ import pytest
 
 import lae_sim
 from lae_sim.events import KINDS
+from lae_sim.sweep import sweep_figure
 
 ROOT = Path(__file__).parents[1]
 SLOW = ROOT / "traces" / "synthetic-slow.parquet"
@@ -254,6 +255,60 @@ def test_a_picture(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["curves.png"]
 
 
+def test_a_sweep_is_the_single_replays_one_after_another(tmp_path):
+    options = ("--per-sequence", "--cost", "kalman=2ms", "--sigma", "0", "1/2")
+    swept = replay_json(SLOW, FAST, "--fps", "60", "30", "--latency-scale", "1/2", "1", *options)
+    singles = [
+        replay_json(trace, "--fps", fps, "--latency-scale", scale, *options)["traces"][0]
+        for trace in (SLOW, FAST)
+        for fps in ("60", "30")
+        for scale in ("1/2", "1")
+    ]
+    assert swept["traces"] == singles
+    assert [each["fps"] for each in singles[:4]] == ["60", "60", "30", "30"]
+    assert [each["latency_scale"] for each in singles[:4]] == ["1/2", "1", "1/2", "1"]
+    # twice the rate is twice the time that everything takes
+    assert [r["auc"] for r in replay_json(SLOW, "--fps", "60")["traces"][0]["results"]] == [
+        r["auc"] for r in replay_json(SLOW, "--latency-scale", "2")["traces"][0]["results"]
+    ]
+
+
+def test_a_sweep_has_columns_and_says_what_it_is_of():
+    text = replay(SLOW, "--fps", "15", "30000/1001", "--attributes", "--per-sequence")
+    tables = [line for line in text.splitlines() if "forecaster" in line]
+    assert len(tables) == 5
+    assert all(line.split()[2] == "fps" for line in tables)
+    assert any(line.split()[1:3] == ["hold", "30000/1001"] for line in text.splitlines())
+    assert "a sweep of the rate is one of how fast the world moves" in text
+    text = replay(SLOW, "--latency-scale", "1/2", "2")
+    assert text.split()[2] == "scale"
+    assert "how fast the world moves" not in text
+    assert "how fast the world moves" in " ".join(replay("--help").split())
+
+
+def test_what_forecasting_costs_is_measured_once_in_a_sweep():
+    found = replay_json(SLOW, "--latency-scale", "1", "2", "--cost", "measured")["traces"]
+    assert found[0]["forecaster_cost_ns"] == found[1]["forecaster_cost_ns"]
+
+
+def test_the_picture_of_a_sweep(tmp_path):
+    both = ("--fps", "60", "15", "30", "--latency-scale", "1", "2")
+    replay(SLOW, *both, "--plot", tmp_path / "both.svg")
+    text = (tmp_path / "both.svg").read_text()
+    for written in ("world frame rate (fps)", "times x 2", "offline", "kalman", "AUC"):
+        assert f"<!-- {written} -->" in text
+    reports = replay_json(SLOW, REAL_TIME, *both[:4], "--sigma", "0", "1", "--policy", "latest",
+        "--sequence", "boat-calm", "--latency", "constant:40s")["traces"]  # fmt: skip
+    labels = ["a", "a", "a", "b", "b", "b"]
+    figure = sweep_figure(reports, labels, 1.0, ["fps"])
+    assert [axes.get_title() for axes in figure.axes] == ["a", "a", "b", "b"]
+    assert [len(axes.lines) for axes in figure.axes] == [3, 3, 2, 2]  # b lacks frames
+    line = figure.axes[0].lines[1]
+    assert (line.get_label(), line.get_xdata().tolist()) == ("kalman", [15, 30, 60])
+    expected = [r["auc"] for k in (1, 2, 0) for r in reports[k]["results"][3:]]
+    assert line.get_ydata().tolist() == expected
+
+
 FORECASTER = """
 class Still:
     def __init__(self, box, image_size=None):
@@ -310,6 +365,8 @@ def test_a_forecaster_of_ones_own(tmp_path):
         ([SLOW, "--timing", "missing.parquet"], "no such file"),
         ([SLOW, FAST, "--outputs", "out.parquet"], "one trace at a time"),
         ([SLOW, "--outputs", "out", "--events", "./out"], "or another output"),
+        ([SLOW, "--fps", "15", "30", "--schedule", "s.parquet"], "--schedule takes one frame rate"),
+        ([SLOW, "--latency-scale", "1", "2", "--export-txt", "d"], "--export-txt takes one frame"),
         ([SLOW, "--schedule", SLOW], "would replace a file that is read"),
         ([SLOW, "--timing", FAST, "--plot", FAST], "would replace a file that is read"),
         ([SLOW, "--outputs", os.devnull], "is not a file"),
