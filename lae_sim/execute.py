@@ -49,10 +49,10 @@ class Store:
             for path in (self.results, self._about, self._unused):
                 path.mkdir(exist_ok=True)
             wanted = {f"{cell.key}.parquet" for cell in cells}
-            for path in self.results.glob("*.parquet"):
+            for path in self.results.glob("[!.]*.parquet"):
                 if path.name not in wanted:
                     path.replace(self._unused / path.name)
-            for path in self._unused.glob("*.parquet"):
+            for path in self._unused.glob("[!.]*.parquet"):
                 if path.name in wanted:
                     path.replace(self.results / path.name)
         except OSError as error:

@@ -51,11 +51,15 @@ def check_distinct(
     Raises:
         LaeError: if two of them are the same file.
     """
-    taken = {os.path.realpath(path) for path in inputs}
+    taken = {_real(path) for path in inputs}
     for path in outputs:
-        if os.path.realpath(path) in taken:
+        if _real(path) in taken:
             raise LaeError(f"{path} would replace a file that is read, or another output")
-        taken.add(os.path.realpath(path))
+        taken.add(_real(path))
+
+
+def _real(path: str | os.PathLike[str]) -> str:
+    return os.path.realpath(str(path).removeprefix("file://"))
 
 
 def _sync(path: Path) -> None:

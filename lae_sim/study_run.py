@@ -21,7 +21,8 @@ from lae_sim.execute import Failure, Store, cluster_executor, local_executor, ru
 from lae_sim.files import written_whole
 from lae_sim.plan import Plan, Source, make_plan
 from lae_sim.study_file import Study
-from lae_sim.study_summary import Row, Scores, compare_traces, read_scores, summarise_study
+from lae_sim.study_pairs import compare_traces
+from lae_sim.study_summary import Row, Scores, read_scores, summarise_study
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -36,7 +37,7 @@ class StudyResults:
         plan: what was computed.
         scores: of every finished trace, setting, convention and forecaster.
         summary: rows (see :func:`lae_sim.study_summary.summarise_study`).
-        comparisons: pairs of traces (see :func:`lae_sim.study_summary.compare_traces`).
+        comparisons: pairs of traces (see :func:`lae_sim.study_pairs.compare_traces`).
         required: what a required AUC asks for (see :func:`lae_sim.deployment.requirement`).
         traces: what ``lae-sim show --json`` says of each trace.
         computed: how many cells were computed now, and not found finished.

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -133,7 +132,9 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
             if name in over_sigmas:
                 over_sigmas[name].append(values.mean(axis=2))
             values = values[:, :, 0] if name in _ONCE else values
-            sums[name] = sums.get(name, 0) + values.sum(axis=0)
+            # one after another from the first repetition on, however they were dealt out
+            before = [sums[name][None]] if name in sums else []
+            sums[name] = np.add.reduce(np.concatenate([*before, values]))
     total = sum(cell.setting.count for cell in cells)
     return Scores(
         source=source,
@@ -206,7 +207,7 @@ def _rows(
         "exact": departures == 0,
         "approximate_share": departures / calls if calls else 0.0,
         "elapsed_ms": _mean(scores.once["elapsed_ms"]),
-        "skip_rate": 1 - scores.once["processed"].sum() / scores.once["world_frames"].sum(),
+        "skip_rate": float(1 - scores.once["processed"].sum() / scores.once["world_frames"].sum()),
     }
     offline = {f"offline_{m}": _mean(scores.once[f"offline_{m}"]) for m in METRICS}
     frames = scores.once["world_frames"]
@@ -251,16 +252,16 @@ def _uncertain(
         drawn = weights[count]
         mean = ours[:, kept].mean(axis=0)
         resampled = np.einsum("s,rs->r", mean, drawn)
-        found[f"{metric}_low"], found[f"{metric}_high"] = _ends(resampled)
+        found[f"{metric}_low"], found[f"{metric}_high"] = ends(resampled)
         if len(ours) > 1:
-            jitter = _ends(ours[:, kept].mean(axis=1))
+            jitter = ends(ours[:, kept].mean(axis=1))
             found[f"{metric}_jitter_low"], found[f"{metric}_jitter_high"] = jitter
         if base is None:
             continue
         bare = base[:, kept].mean(axis=0)
         won = resampled - np.einsum("s,rs->r", bare, drawn)
         found[f"vs_hold_{metric}"] = float(mean.mean() - bare.mean())
-        found[f"vs_hold_{metric}_low"], found[f"vs_hold_{metric}_high"] = _ends(won)
+        found[f"vs_hold_{metric}_low"], found[f"vs_hold_{metric}_high"] = ends(won)
         found[f"vs_hold_{metric}_p"] = signed_rank_p(np.round(mean - bare, 12))
         if not np.isnan(offline[kept]).any():
             loss = float(offline[kept].mean() - bare.mean())
@@ -268,7 +269,7 @@ def _uncertain(
             if loss > 0:
                 found[f"recovered_{metric}"] = float(mean.mean() - bare.mean()) / loss
             if (lost > 0).all():
-                shares = _ends(won / lost)
+                shares = ends(won / lost)
                 found[f"recovered_{metric}_low"], found[f"recovered_{metric}_high"] = shares
     return found
 
@@ -326,87 +327,8 @@ def _mark_front(rows: Sequence[Row]) -> None:
             )
 
 
-def compare_traces(
-    scores: Sequence[Scores], seed: int = 0, resamples: int = RESAMPLES
-) -> list[Row]:
-    """Traces of one dataset against each other: in every setting, with every forecaster.
-
-    Returns:
-        A row per pair, at the first sigma (or, on the whole grid of sigmas, of the means over it):
-        ``difference`` of the mean AUC with its interval; ``p`` of Wilcoxon's signed-rank test over
-        the sequences, and ``p_holm``, corrected for the number of pairs of its group (Holm, "A
-        Simple Sequentially Rejective Multiple Test Procedure", 1979); ``better_here``, how probable
-        it is that one run of A beats one of B on these sequences (0 or 1 without jitter, 1/2 for a
-        tie), and ``better``, the same on other sequences like these (bootstrap, a repetition drawn
-        for each sequence).
-    """
-    together: dict[tuple[str, ...], list[Scores]] = {}
-    for each in scores:
-        together.setdefault((*each.group, each.forecaster), []).append(each)
-    rows = []
-    for group in together.values():
-        ours = [_pair(a, b, seed, resamples) for a, b in combinations(group, 2)]
-        known = [row for row in ours if row is not None]
-        previous = 0.0
-        for rank, row in enumerate(sorted(known, key=lambda row: row["p"])):
-            previous = row["p_holm"] = max(previous, min(1.0, row["p"] * (len(known) - rank)))
-        rows += known
-    return rows
-
-
-def _pair(a: Scores, b: Scores, seed: int, resamples: int) -> Row | None:
-    """A against B; None if they have no sequences in common that count."""
-    whole = set(SIGMA_GRID) == set(a.setting.sigmas)
-    which = "over_sigmas" if whole else "repeated"
-    both = sorted(set(a.sequences) & set(b.sequences))
-    ours, theirs = (
-        getattr(one, which)["auc"][:, [one.sequences.index(name) for name in both]]
-        for one in (a, b)
-    )
-    kept = ~np.isnan(ours.mean(axis=0) + theirs.mean(axis=0))
-    if not kept.any():
-        return None
-    ours, theirs = ours[:, kept], theirs[:, kept]
-    count = ours.shape[1]
-    weights = bootstrap_weights(count, resamples, seed)
-    difference = ours.mean(axis=0) - theirs.mean(axis=0)
-    low, high = _ends(np.einsum("s,rs->r", difference, weights))
-    random = np.random.Generator(np.random.PCG64([seed, count, len(ours), len(theirs)]))
-    margins = np.zeros(resamples)
-    for s in range(count):  # one sequence after another: resamples x sequences would be large
-        run = ours[random.integers(0, len(ours), resamples), s]
-        margins += weights[:, s] * (run - theirs[random.integers(0, len(theirs), resamples), s])
-    here = np.sign(np.round(ours.mean(axis=1)[:, None] - theirs.mean(axis=1), 12))
-    setting = a.setting
-    return {
-        "dataset": a.source.metadata.dataset,
-        "policy": setting.policy,
-        "fps": str(setting.fps),
-        "latency": setting.latency,
-        "scale": str(setting.scale),
-        "convention": a.convention,
-        "forecaster": a.forecaster,
-        "sigma": MEAN if whole else str(setting.sigmas[0]),
-        "a": _run_label(a),
-        "b": _run_label(b),
-        "sequences": count,
-        "difference": float(difference.mean()),
-        "difference_low": low,
-        "difference_high": high,
-        "p": signed_rank_p(np.round(difference, 12)),
-        "better_here": float((here.mean() + 1) / 2),
-        "better": float((np.sign(np.round(margins, 12)).mean() + 1) / 2),
-    }
-
-
-def _run_label(scores: Scores) -> str:
-    """The trace, and the device whose times it was replayed with, if another's."""
-    setting = scores.setting
-    own = setting.timing is None
-    return setting.trace.label + ("" if own else f" at {setting.timing.label}")  # type: ignore[union-attr]  # own
-
-
-def _ends(samples: Floats) -> tuple[float, float]:
+def ends(samples: Floats) -> tuple[float, float]:
+    """The range of the middle 95 % of samples."""
     low, high = np.quantile(samples, _TAILS).tolist()
     return low, high
 
