@@ -1,0 +1,405 @@
+"""The pictures of a study, as SVG: the same results give the same bytes.
+
+A tracker has one colour and mark throughout, and a forecaster one kind of line. Pictures that would
+hold too much choose, and say so.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lae_sim.clock import parse_duration
+from lae_sim.metrics import CENTRE_THRESHOLDS
+from lae_sim.plots import new_figure
+from lae_sim.study_summary import MEAN, Row, Scores
+from lae_sim.study_tables import (
+    names,
+    reference,
+    referred,
+    run_of,
+    scores_row,
+    setting_of,
+    told_setting,
+    whole_rows,
+)
+from lae_sim.study_text import SETTINGS
+from lae_sim.tabular import printable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+    from lae_sim.study_run import StudyResults
+
+MOST_CURVES, MOST_PAIRS, MOST_BARS, MOST_HISTOGRAMS = 8, 6, 30, 30
+"""What one picture holds of curves, rows and histograms, and how many curve pictures there are."""
+
+# Okabe and Ito, "Color Universal Design", 2008, less the yellow, and three darker ones
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#332288", "#999933")
+_MARKS = "osD^vP*X"
+_LINES = ("-", "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (5, 1)), (0, (1, 1)))
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of a page.
+
+    Attributes:
+        caption: what it shows, and what was chosen of more.
+        svg: the file.
+    """
+
+    caption: str
+    svg: bytes
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is told apart by what.
+
+    Attributes:
+        names: of the runs.
+        forecasters: names, hold first.
+    """
+
+    names: dict[str, str]
+    forecasters: tuple[str, ...]
+
+    @classmethod
+    def of(cls, results: StudyResults) -> Look:
+        """The look of a study."""
+        rows = results.summary
+        return cls(names(rows), tuple(dict.fromkeys(row["forecaster"] for row in rows)))
+
+    def style(self, run: str, forecaster: str = "hold") -> dict[str, Any]:
+        """Colour and mark of the tracker, line of the forecaster."""
+        place = list(dict.fromkeys(self.names.values())).index(self.names[run])
+        n = len(_COLOURS)
+        return {
+            "color": _COLOURS[place % n],
+            "marker": _MARKS[(place + place // n) % len(_MARKS)],
+            "linestyle": self.line(forecaster),
+            "markersize": 4,
+        }
+
+    def line(self, forecaster: str) -> Any:
+        """Hold is dotted; offline, dashed, is no forecaster."""
+        place = self.forecasters.index(forecaster)
+        return ":" if forecaster == "hold" else _LINES[(place - 1) % len(_LINES)]
+
+    def best(self, rows: Sequence[Row]) -> tuple[list[Row], str]:
+        """The rows of the best trackers, as many as a panel may hold, and what was left out."""
+        best: dict[str, float] = {}
+        for row in rows:
+            best[run_of(row)] = max(best.get(run_of(row), 0), row["auc"] or 0)
+        shown = max(1, MOST_CURVES // len(self.forecasters))
+        kept = sorted(best, key=lambda run: -best[run])[:shown]
+        told = f"the best {len(kept)} of {len(best)} trackers" if len(kept) < len(best) else ""
+        return [row for row in rows if run_of(row) in kept], told
+
+
+def drawn(caption: str, draw: Callable[[], Figure]) -> Picture:
+    """Draw a picture."""
+    import matplotlib
+    from cycler import cycler
+
+    settings: dict[Any, Any] = {
+        "svg.hashsalt": "lae_sim",
+        "svg.fonttype": "none",
+        "text.parse_math": False,  # names hold what they hold
+        "axes.prop_cycle": cycler(color=_COLOURS),
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "grid.alpha": 0.3,
+        "font.size": 9,
+        "legend.frameon": False,
+    }
+    file = io.BytesIO()
+    with matplotlib.rc_context(settings), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)
+        draw().savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    return Picture(caption, file.getvalue())
+
+
+def _below(figure: Figure, columns: int = 4) -> None:
+    """One legend of all panels, below them."""
+    found = {
+        label: handle
+        for axes in figure.axes
+        for handle, label in zip(*axes.get_legend_handles_labels())
+    }
+    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=columns)
+
+
+def curves(results: StudyResults, look: Look) -> Iterator[Picture]:
+    """Success and precision of each dataset, at the settings that stand for all, then others."""
+    chosen = reference(results.summary)
+    groups: dict[tuple[Any, ...], list[Scores]] = {}
+    for scores in results.scores:
+        groups.setdefault(scores.group, []).append(scores)
+
+    def stands(group: list[Scores]) -> bool:
+        return any(chosen[run_of(row)] == setting_of(row) for row in map(scores_row, group))
+
+    ordered = sorted(groups.values(), key=lambda group: not stands(group))
+    for group in ordered[:MOST_PAIRS]:
+        rows = [
+            {**scores_row(s), "sigma": str(s.setting.sigmas[0]), "auc": _mean(s), "scores": s}
+            for s in group
+        ]
+        rows, told = look.best(rows)
+        what = f"{printable(rows[0]['dataset'])}: {told_setting(rows)}"
+        caption = f"{what}{'; ' * bool(told)}{told}. In brackets: AUC, and precision at 20 px."
+        yield drawn(caption, lambda rows=rows: _curves(rows, look))  # type: ignore[misc]
+    if len(ordered) > MOST_PAIRS:
+        left = len(ordered) - MOST_PAIRS
+        yield Picture(f"{left} more settings are in the ranking, and not drawn here.", b"")
+
+
+def _mean(scores: Scores) -> float:
+    known = scores.means["auc"][:, 0]
+    return float(np.nanmean(known)) if (known == known).any() else 0.0
+
+
+def _curves(rows: Sequence[Row], look: Look) -> Figure:
+    figure = new_figure(10, 4.2 + 0.17 * len(rows) / 2)
+    left, right = figure.subplots(1, 2)
+    for row in rows:
+        run, forecaster = run_of(row), row["forecaster"]
+        style = {**look.style(run, forecaster), "marker": ""}
+        lines = [(f"{look.names[run]}, {printable(forecaster)}", "", style)]
+        if forecaster == "hold":
+            lines.insert(0, (f"{look.names[run]}, offline", "offline_", {**style, "ls": "--"}))
+        for name, which, style in lines:
+            style.pop("linestyle" if which else "", None)
+            means = [about["curves"] for about in row["scores"].about]
+            if means[0][f"{which}success"] is None:
+                continue
+            success, precision = (
+                np.mean([mean[which + kind] for mean in means], axis=0)
+                for kind in ("success", "precision")
+            )
+            label = f"{name} [{success.mean():.3f}, {precision[20]:.3f}]"
+            left.plot(np.linspace(0, 1, len(success)), success, label=label, **style)
+            right.plot(CENTRE_THRESHOLDS, precision, label=label, **style)
+    left.set(xlabel="overlap threshold", ylabel="success", xlim=(0, 1), ylim=(0, 1))
+    right.set(xlabel="centre error threshold (px)", ylabel="precision", xlim=(0, 50), ylim=(0, 1))
+    _below(figure, 2)
+    return figure
+
+
+SWEEPS = {
+    "sigma": "permitted latency σ (frames)",  # noqa: RUF001
+    "scale": "scale of all times (2: half as fast)",
+    "fps": "world rate (frames/s)",
+    "latency": "constant latency (ms)",
+}
+"""What scores are drawn over, if a study has several: the key of the summary, and its label."""
+
+
+def sweep(results: StudyResults, look: Look, key: str) -> Picture | None:
+    """AUC and DP of each dataset over a key of ``SWEEPS``; None if it has one value only."""
+    chosen = reference(results.summary)
+    rows = [*results.summary] if key == "sigma" else whole_rows(results)
+    points = []
+    for row in rows:
+        alike = zip(SETTINGS[1:], setting_of(row), chosen[run_of(row)])
+        x = _place(key, row[key])
+        if x is not None and all(ours == its for name, ours, its in alike if name != key):
+            points.append({**row, "x": x})
+    if len({row["x"] for row in points}) < 2:
+        return None
+    datasets = list(dict.fromkeys(row["dataset"] for row in points))
+    kept, left_out = [], []
+    for dataset in datasets:
+        best, told = look.best([row for row in points if row["dataset"] == dataset])
+        kept += best
+        left_out += [f"{printable(dataset)}: {told}"] if told else []
+    told = told_setting(referred(rows), but=key)
+    caption = "; ".join([f"Over {SWEEPS[key].split(' (')[0]}. {told.capitalize()}", *left_out])
+    return drawn(caption, lambda: _sweep(kept, datasets, key, look))
+
+
+def _place(key: str, value: str) -> float | None:
+    """Where a value stands on its axis; None if it is not on it."""
+    if key == "latency":
+        name, _, time = value.partition(":")
+        return parse_duration(time) / 1e6 if name == "constant" else None
+    return None if value == MEAN else float(Fraction(value))
+
+
+def _sweep(rows: Sequence[Row], datasets: Sequence[str], key: str, look: Look) -> Figure:
+    figure = new_figure(10, 0.8 + 2.7 * len(datasets))
+    panels = figure.subplots(len(datasets), 2, squeeze=False, sharex=True)
+    mean = "m" if rows[0]["sigma"] == MEAN else ""
+    for pair, dataset in zip(panels, datasets):
+        lines: dict[tuple[str, str], list[Row]] = {}
+        for row in rows:
+            if row["dataset"] == dataset:
+                lines.setdefault((run_of(row), row["forecaster"]), []).append(row)
+        for axes, metric, label in zip(pair, ("auc", "dp20"), (f"{mean}AUC", f"{mean}DP")):
+            for (run, forecaster), its in lines.items():
+                its = sorted(its, key=lambda row: row["x"])
+                style = look.style(run, forecaster) | ({"marker": ""} if len(its) > 12 else {})
+                ys = [np.nan if row[metric] is None else row[metric] for row in its]
+                name = f"{look.names[run]}, {printable(forecaster)}"
+                axes.plot([row["x"] for row in its], ys, label=name, **style)
+            axes.set(ylabel=label, title=printable(dataset))
+            if axes.get_subplotspec().is_last_row():
+                axes.set_xlabel(SWEEPS[key])
+            xs = sorted({row["x"] for row in rows})
+            if key == "scale" and xs[0] > 0:
+                axes.set_xscale("log", base=2)
+            if len(xs) <= 8:
+                axes.set_xticks(xs, [f"{x:g}" for x in xs])
+    _below(figure)
+    return figure
+
+
+def front(results: StudyResults, look: Look) -> Picture:
+    """AUC against the time of a call, and the Pareto front of each dataset and forecaster."""
+    rows = [row for row in referred(whole_rows(results)) if row["auc"] is not None]
+    caption = "AUC against the mean time of a call; lines join what no other tracker beats in both"
+    return drawn(f"{caption}. {told_setting(rows).capitalize()}", lambda: _front(rows, look))
+
+
+def _front(rows: Sequence[Row], look: Look) -> Figure:
+    datasets = list(dict.fromkeys(row["dataset"] for row in rows))
+    columns = min(len(datasets), 2)
+    lines = -(-len(datasets) // columns)
+    figure = new_figure(10, 0.8 + 3.6 * lines)
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axes, dataset in zip(panels, datasets):
+        ours = [row for row in rows if row["dataset"] == dataset]
+        for forecaster in look.forecasters:
+            its = sorted(
+                (row for row in ours if row["forecaster"] == forecaster and row["pareto"]),
+                key=lambda row: row["elapsed_ms"],
+            )
+            xs, ys = [row["elapsed_ms"] for row in its], [row["auc"] for row in its]
+            style = {"color": "0.45", "linestyle": look.line(forecaster), "zorder": 1}
+            axes.plot(xs, ys, label=f"front, {printable(forecaster)}", **style)
+        for row in ours:
+            filled = "full" if row["forecaster"] != "hold" else "none"
+            style = {**look.style(run_of(row)), "linestyle": "", "fillstyle": filled}
+            axes.plot(row["elapsed_ms"], row["auc"], **{**style, "markersize": 7})
+        axes.margins(x=0.2, y=0.1)
+        best: dict[str, Row] = {}
+        for row in sorted(ours, key=lambda row: row["auc"]):
+            best[run_of(row)] = row
+        # a label beside each tracker's best point, moved up where the one below is too near
+        low, high = axes.get_ylim()
+        least, below = 0.055 * (high - low), -np.inf
+        for run, row in best.items():
+            below = max(row["auc"], below + least)
+            place = (row["elapsed_ms"], below)
+            axes.annotate(
+                look.names[run], place, (8, 0), textcoords="offset points", va="center", fontsize=8
+            )
+        axes.set(xlabel="mean time of a call (ms)", ylabel="AUC", title=printable(dataset))
+        axes.set_ylim(low, max(high, below + least))
+    for axes in panels[len(datasets) :]:
+        axes.remove()
+    _below(figure)
+    return figure
+
+
+def gains(results: StudyResults, look: Look) -> Picture | None:
+    """What each forecaster wins over hold for each tracker; None if there is only hold."""
+    rows = [row for row in referred(whole_rows(results)) if "vs_hold_auc_low" in row]
+    if not rows:
+        return None
+    runs = sorted({run_of(row) for row in rows}, key=list(look.names).index)
+    best = {run: max(row["vs_hold_auc"] for row in rows if run_of(row) == run) for run in runs}
+    kept = sorted(runs, key=lambda run: -best[run])[:MOST_BARS]
+    told = f"; the {len(kept)} largest of {len(runs)}" if len(kept) < len(runs) else ""
+    caption = (
+        f"What forecasters win over hold, with 95 % intervals over sequences{told}. "
+        + told_setting(rows).capitalize()
+    )
+    kept_rows = [row for row in rows if run_of(row) in kept]
+    return drawn(caption, lambda: _gains(kept_rows, kept, look))
+
+
+def _gains(rows: Sequence[Row], runs: Sequence[str], look: Look) -> Figure:
+    figure = new_figure(10, 1.3 + 0.3 * len(runs) + 0.1 * len(rows))
+    panels = figure.subplots(1, 2, sharey=True)
+    rivals = [name for name in look.forecasters if name != "hold"]
+    datasets = {run_of(row): printable(row["dataset"]) for row in rows}
+    several = len(set(datasets.values())) > 1
+    for axes, key, factor in zip(panels, ("vs_hold_auc", "recovered_auc"), (1, 100)):
+        axes.axvline(0, color="0.4", linewidth=0.8)
+        for f, forecaster in enumerate(rivals):
+            its = {run_of(row): row for row in rows if row["forecaster"] == forecaster}
+            for run, row in its.items():
+                if (value := row.get(key)) is None:
+                    continue
+                y = runs.index(run) + 0.7 * ((f + 0.5) / len(rivals) - 0.5)
+                colour = _COLOURS[f % len(_COLOURS)]
+                ends = [
+                    factor * row[f"{key}_{end}"] for end in ("low", "high") if f"{key}_{end}" in row
+                ]
+                axes.plot(ends, [y] * len(ends), color=colour, linewidth=1.5)
+                label = printable(forecaster)
+                axes.plot(factor * value, y, _MARKS[f % 8], color=colour, label=label, markersize=5)
+    panels[0].set(xlabel="AUC won over hold", ylim=(len(runs) - 0.5, -0.5))
+    panels[1].set(xlabel="latency loss recovered (%)")
+    low, high = panels[1].get_xlim()
+    panels[1].set_xlim(max(low, -100), min(high, 150))  # where little was lost, intervals are wide
+    panels[0].set_yticks(
+        range(len(runs)),
+        [look.names[r] + (f" ({datasets[r]})" if several else "") for r in runs],
+    )
+    _below(figure)
+    return figure
+
+
+def attributes(summary: DataFrame) -> Iterator[Picture]:
+    """Gains on the sequences of each attribute, all trackers of a dataset together."""
+    from lae_sim.comparison_plots import attribute_bars
+
+    for dataset, group in summary.groupby("dataset", sort=False):
+        known = group["recovered"].notna().any()
+        rivals = group["forecaster"].nunique() > 2
+        value = "recovered" if known and rivals else "mean"
+        yield drawn(
+            f"{dataset}: " + ("share of the latency loss recovered" if known else "AUC")
+            + " on the sequences of each attribute (n of them), with 95 % intervals",
+            lambda group=group, value=value: attribute_bars(group, "auc", value),  # type: ignore[misc]
+        )  # fmt: skip
+
+
+def histograms(results: StudyResults) -> Picture | None:
+    """How long the calls of each trace took."""
+    traces = [trace for trace in results.traces if trace["times"]["histogram"]]
+    if not traces:
+        return None
+    shown = traces[:MOST_HISTOGRAMS]
+    told = f"; the first {len(shown)} of {len(traces)} traces" if len(shown) < len(traces) else ""
+    caption = "Times of the calls; dashed: the interval between frames"
+    return drawn(caption + told, lambda: _histograms(shown))
+
+
+def _histograms(traces: Sequence[Row]) -> Figure:
+    lines = -(-len(traces) // 3)
+    figure = new_figure(10, 0.3 + 1.9 * lines)
+    panels = figure.subplots(lines, 3, squeeze=False).ravel()
+    for axes, trace in zip(panels, traces):
+        found, interval = trace["times"]["histogram"], trace["times"]["frame_interval_ms"]
+        axes.stairs(found["counts"], found["edges_ms"], fill=True, color=_COLOURS[0])
+        axes.set_title(printable(trace["trace"]), fontsize=8)
+        outside = found["below"] + found["above"]
+        axes.set_xlabel(f"ms ({outside:,} of {trace['times']['calls']['n']:,} calls outside)")
+        if found["edges_ms"][0] < interval < found["edges_ms"][-1]:
+            axes.axvline(interval, color=_COLOURS[1], linestyle="--", linewidth=1)
+    for axes in panels[len(traces) :]:
+        axes.remove()
+    return figure
