@@ -9,7 +9,6 @@ looks at more than the last call, instants beyond 64 bits, and whatever ends in 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import chain
 from typing import cast
 
 import numpy as np
@@ -19,6 +18,7 @@ from lae_sim.engine import Ints, Policy, Schedule, Service, simulate
 from lae_sim.latency import Times
 from lae_sim.policies import LanePolicy
 
+_CELLS = 1 << 20  # lanes x frames in memory at once, a few arrays of them
 _STEPS = 32  # calls from one sorting-out of the lanes that have ended to the next
 _FEWEST = 8  # lanes that are faster together than one by one
 
@@ -48,73 +48,80 @@ def simulate_lanes(
     Raises:
         LaeError: what ``simulate`` raises, when that sequence's turn comes.
     """
-    schedules: list[Schedule | None] = [None] * len(lengths)
-    if batchable(services, policy) and min(lengths, default=0) > 0:
+    found: list[Schedule | None] = [None] * len(lengths)
+    if len(lengths) >= _FEWEST and min(lengths) > 0 and batchable(services, policy):
         times, rule = cast("Sequence[Times]", services), cast(LanePolicy, policy)
-        for by_call in (True, False):
-            lanes = [i for i, lane in enumerate(times) if lane.by_call == by_call]
-            if len(lanes) >= _FEWEST:
-                sizes = np.array([lengths[i] for i in lanes])
-                found = _schedules(sizes, clock, [times[i].ns for i in lanes], by_call, rule)
-                for i, schedule in zip(lanes, found):
-                    schedules[i] = schedule
-    for length, service, schedule in zip(lengths, services, schedules):
+        for lanes in _chunks(lengths):
+            sizes = np.array([lengths[i] for i in lanes])
+            for i, schedule in zip(lanes, _together(sizes, clock, [times[i] for i in lanes], rule)):
+                found[i] = schedule
+    for length, service, schedule in zip(lengths, services, found):
         yield schedule or simulate(length, clock, service, policy)
 
 
-def _schedules(
-    lengths: Ints, clock: Clock, times: Sequence[Ints], by_call: bool, policy: LanePolicy
-) -> list[Schedule | None]:
-    """The schedules of lanes, None for those that the SimPy engine is to have."""
-    interval, ticks_per_ns = clock.frame_ticks, clock.ticks_per_ns
-    # every lane has its place in flat arrays, with room for the steps after its end
-    offsets = np.concatenate([[0], np.cumsum(lengths + _STEPS)])
-    none = np.full(lengths.max() + _STEPS, -1, np.int64)
-    parts = (
-        (ns[:n], none[: _STEPS + max(n - len(ns), 0)]) for ns, n in zip(times, lengths.tolist())
-    )
-    flat = np.concatenate([*chain.from_iterable(parts)])
-    longest = max(int(flat.max()), 1)
-    if int(lengths.max()) * interval + longest * ticks_per_ns > MAX_INT64:
-        return [None] * len(times)
+def _chunks(lengths: Sequence[int]) -> Iterator[list[int]]:
+    """All lanes, in chunks of similar lengths, the shortest first."""
+    chunk: list[int] = []
+    for i in sorted(range(len(lengths)), key=lengths.__getitem__):
+        if chunk and (len(chunk) + 1) * lengths[i] > _CELLS:
+            yield chunk
+            chunk = []
+        chunk.append(i)
+    yield chunk
 
-    upcoming = np.lib.stride_tricks.sliding_window_view(flat, _STEPS)
-    done = np.empty((3, len(flat)), np.int64)
-    slots = np.lib.stride_tricks.sliding_window_view(done, _STEPS, axis=1, writeable=True)
-    calls = np.zeros(len(times), np.int64)
-    faulty = np.zeros(len(times), np.bool_)
-    lane = np.arange(len(times))
-    frame = start = np.zeros(len(times), np.int64)
-    k = 0
-    while len(lane):
-        place, length = offsets[lane], lengths[lane]
-        end = length * interval
-        block = np.empty((3, _STEPS, len(lane)), np.int64)
-        running = np.empty((_STEPS, len(lane)), np.bool_)
-        drawn = np.ascontiguousarray(upcoming[place + k].T) if by_call else None
-        runs = np.ones(len(lane), np.bool_)
-        for step in range(_STEPS):
-            running[step] = runs
-            block[0, step], block[1, step] = frame, start
-            ready = block[2, step]
-            ns = flat.take(place + frame, mode="clip") if drawn is None else drawn[step]
-            np.multiply(ns, ticks_per_ns, out=ready)
-            ready += start
-            frame = policy.next_lanes(clock, frame, ready)
-            start = np.maximum(ready, frame * interval)
-            runs &= (frame < length) & (start < end)
-        backward = block[0, 1:] <= block[0, :-1]
-        slots[:, place + k] = block.transpose(0, 2, 1)
-        calls[lane] += running.sum(axis=0)
-        wrong = (block[2] < block[1]) & running
-        wrong[1:] |= backward & running[1:]
-        faulty[lane] |= wrong.any(axis=0) | (runs & (frame <= block[0, -1]))
-        runs &= ~faulty[lane]
-        lane, frame, start = lane[runs], frame[runs], start[runs]
-        k += _STEPS
-    return [
-        None if bad else Schedule(clock, length, *done[:, first : first + n])
-        for bad, length, first, n in zip(
-            faulty.tolist(), lengths.tolist(), offsets.tolist(), calls.tolist()
+
+def _together(
+    lengths: Ints, clock: Clock, times: Sequence[Times], policy: LanePolicy
+) -> list[Schedule | None]:
+    """The schedules of lanes, shortest first; None for those that the SimPy engine is to have."""
+    interval, width = clock.frame_ticks, len(lengths)
+    taken = np.empty((width, int(lengths[-1]) + _STEPS), np.int64)
+    for space, lane in zip(taken, times):
+        known = lane.ns[: len(space)]
+        space[: len(known)], space[len(known) :] = known, -1
+    longest = max(int(taken.max()), 1) * clock.ticks_per_ns
+    if int(lengths[-1]) * interval + longest > MAX_INT64:
+        return [None] * width
+    taken *= clock.ticks_per_ns
+    by_call = np.array([lane.by_call for lane in times])
+    in_turn = taken.T.copy() if by_call.all() else None
+    # one row for each call of all lanes, and room for the steps after the end of the last one
+    frames, starts, ready = done = np.empty((3, taken.shape[1] + 1, width), np.int64)
+    frames[0] = starts[0] = 0
+    calls = np.zeros(width, np.int64)
+    faulty = np.zeros(width, np.bool_)
+    runs = np.ones(width, np.bool_)
+    k = first = 0  # the lanes before the first have ended
+    while first < width:
+        here, rest = slice(k, k + _STEPS), slice(first, None)
+        after = slice(k + 1, k + _STEPS + 1)
+        row = np.arange(first, width) * taken.shape[1]
+        frame, start = frames[k, rest], starts[k, rest]
+        rows = zip(frames[after, rest], starts[after, rest], ready[here, rest])
+        for step, (following, begin, end) in enumerate(rows, k):
+            if in_turn is None:
+                at = np.where(by_call[rest], step, frame)
+                np.add(start, taken.take(row + at, mode="clip"), out=end)
+            else:
+                np.add(start, in_turn[step, rest], out=end)
+            following[:] = policy.next_lanes(clock, frame, end)
+            np.maximum(end, following * interval, out=begin)
+            frame, start = following, begin
+        running = np.empty((_STEPS + 1, width - first), np.bool_)
+        running[0] = runs[rest]
+        running[1:] = (frames[after, rest] < lengths[rest]) & (
+            starts[after, rest] < lengths[rest] * interval
         )
+        np.logical_and.accumulate(running, out=running)
+        calls[rest] += running[:-1].sum(axis=0)
+        wrong = running[:-1] & (ready[here, rest] < starts[here, rest])
+        wrong |= running[1:] & (frames[after, rest] <= frames[here, rest])
+        faulty[rest] |= wrong.any(axis=0)
+        runs[rest] = running[-1] & ~faulty[rest]
+        first = int(np.append(runs, True)[first:].argmax()) + first
+        k += _STEPS
+    columns = done[:, : calls.max()].transpose(0, 2, 1).copy()
+    return [
+        None if bad else Schedule(clock, length, *columns[:, i, :n])
+        for i, (bad, length, n) in enumerate(zip(faulty.tolist(), lengths.tolist(), calls.tolist()))
     ]
