@@ -120,8 +120,10 @@ def _together(
         runs[rest] = running[-1] & ~faulty[rest]
         first = int(np.append(runs, True)[first:].argmax()) + first
         k += _STEPS
-    columns = done[:, : calls.max()].transpose(0, 2, 1).copy()
+    lane_by_lane = zip(*done[:, : calls.max()].transpose(0, 2, 1).copy())
     return [
-        None if bad else Schedule(clock, length, *columns[:, i, :n])
-        for i, (bad, length, n) in enumerate(zip(faulty.tolist(), lengths.tolist(), calls.tolist()))
+        None if bad else Schedule(clock, length, frames[:n], starts[:n], ready[:n])
+        for (frames, starts, ready), bad, length, n in zip(
+            lane_by_lane, faulty.tolist(), lengths.tolist(), calls.tolist()
+        )
     ]

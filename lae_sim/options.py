@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli import argument
 from lae_sim.clock import parse_duration, parse_fps, parse_rational
@@ -126,12 +126,14 @@ def add_forecasting(parser: argparse.ArgumentParser) -> None:
 def parse_policy(text: str) -> tuple[Policy, bool]:
     """A policy by name, and whether its outputs count from their own frames' arrival.
 
+    A user's own is named ``package.module:object``: a policy, or a class that makes one.
+
     Raises:
         LaeError: if there is none of that name, or its value does not fit.
     """
     from lae_sim import policies
 
-    name, _, value = text.partition(":")
+    name, colon, value = text.partition(":")
     if text == "latest":
         return policies.latest, False
     if text == "fifo":
@@ -142,21 +144,26 @@ def parse_policy(text: str) -> tuple[Policy, bool]:
         return policies.shrinking_tail(parse_duration(value)), False
     if name == "vot-realtime":
         return policies.vot_realtime(*([_number(text, value)] if value else [])), True
+    if colon and name not in ("latest", "fifo", "shrinking-tail"):
+        policy: Policy = _own("policy", text)
+        return policy, False
     raise LaeError(
         f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
-        "vot-realtime[:GRACE]"
+        "vot-realtime[:GRACE], package.module:object"
     )
 
 
 def parse_latency(text: str) -> LatencySource:
     """A latency source by name.
 
+    A user's own is named ``package.module:object``: a source, or a class that makes one.
+
     Raises:
         LaeError: if there is none of that name, or its value does not fit.
     """
     from lae_sim import latency
 
-    name, _, value = text.partition(":")
+    name, colon, value = text.partition(":")
     if text == "recorded":
         return latency.by_frame
     if text == "by-call":
@@ -167,10 +174,24 @@ def parse_latency(text: str) -> LatencySource:
         return latency.resampled(_number(text, value))
     if name == "lognormal":
         return latency.lognormal(_number(text, value))
+    if name == "bootstrap":
+        seed, *block = value.split(":", 1)
+        return latency.bootstrap(_number(text, seed), *(_number(text, n, least=1) for n in block))
+    if colon and name not in ("recorded", "by-call"):
+        source: LatencySource = _own("latency", text)
+        return source
     raise LaeError(
         f"no latency {text!r}: there are recorded, by-call, constant:47ms, resample:SEED, "
-        "lognormal:SEED"
+        "lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object"
     )
+
+
+def _own(what: str, text: str) -> Any:
+    """What a user made, or an instance of it if it is a class."""
+    from lae_sim.trackers.names import bound, imported
+
+    found = imported(f"{what} {text!r}", text)
+    return bound(f"{what} {text!r}", found, [], {}) if isinstance(found, type) else found
 
 
 def parse_box(text: str) -> tuple[float, ...]:
