@@ -6,6 +6,7 @@ than reading a trace; these do not.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,18 @@ def from_numpy(values: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = N
         bitmap = pa.py_buffer(np.packbits(valid, bitorder="little").tobytes())
     arrow_type = pa.from_numpy_dtype(values.dtype)
     return pa.Array.from_buffers(arrow_type, len(values), [bitmap, pa.py_buffer(values)])
+
+
+def from_texts(texts: Sequence[str], times: int = 1) -> Any:
+    """An Arrow array of texts, each so many times in a row."""
+    import pyarrow as pa
+
+    encoded = [text.encode() for text in texts]
+    ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
+    buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(encoded))]
+    once = pa.Array.from_buffers(pa.string(), len(texts), buffers)
+    codes = from_numpy(np.repeat(np.arange(len(texts), dtype=np.int32), times))
+    return once if times == 1 else pa.DictionaryArray.from_arrays(codes, once).cast(pa.string())
 
 
 def to_numpy(array: Any, dtype: npt.DTypeLike) -> npt.NDArray[Any]:

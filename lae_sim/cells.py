@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim import __version__
-from lae_sim.arrow import from_numpy
+from lae_sim.arrow import from_numpy, from_texts
 from lae_sim.batch import batchable
 from lae_sim.evaluation import Evaluation, evaluate_groups
 from lae_sim.forecast import AnyFactory
@@ -31,6 +31,9 @@ from lae_sim.trace import read_trace
 
 VERSION = 1
 """Of the cells' files; another version is another cell."""
+
+GROUP = 1 << 17
+"""World frames that are scored at once."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +226,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
 
     curves, kept = _Curves(), []
     for part in evaluate_groups(
-        runs(), trace.metadata, chosen, setting.sigmas, convention, costs=costs
+        runs(), trace.metadata, chosen, setting.sigmas, convention, costs=costs, frames=GROUP
     ):
         entries = len(part.sequences)
         for f, writer in enumerate(writers):
@@ -340,12 +343,9 @@ class _Rows:
         }
         values["sigma"] = np.tile(self._sigmas, len(part.sequences))
         rows = len(values["sigma"])
-        names = pa.array(part.sequences).take(
-            from_numpy(np.repeat(np.arange(rows // count), count))
-        )
         columns = {
-            **{name: pa.repeat(text, rows) for name, text in self._constant.items()},
-            "sequence": names,
+            **{name: from_texts([text], rows) for name, text in self._constant.items()},
+            "sequence": from_texts(part.sequences, count),
             **{name: from_numpy(column.astype(COLUMNS[name])) for name, column in values.items()},
         }
         arrays = [columns[name] for name in COLUMNS]

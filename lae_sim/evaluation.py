@@ -30,7 +30,7 @@ from lae_sim.metrics import (
 )
 from lae_sim.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.run import Run
-from lae_sim.trace import batched
+from lae_sim.trace import BATCH_ROWS, batched
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,11 +140,15 @@ def evaluate_groups(
     convention: Convention = PYSOT,
     at_arrival: bool = False,
     costs: Mapping[str, int] | None = None,
+    frames: int = BATCH_ROWS,
 ) -> Iterator[Evaluation]:
-    """The same, group after group of sequences, for those who keep less than all of it."""
+    """The same, group after group of sequences, for those who keep less than all of it.
+
+    The larger the groups (of about ``frames`` world frames), the faster, and the more memory.
+    """
     if not forecasters:
         raise LaeError("name at least one forecaster, such as hold")
-    for group in batched(runs):
+    for group in batched(runs, frames):
         yield _evaluate_group(
             group, metadata, forecasters, sigmas, convention, at_arrival, costs or {}
         )

@@ -80,21 +80,23 @@ class TunedKalman:
         worth: Number = (1 - self.decay**interval) / (1 - self.decay)
         return worth
 
+    def transition(self, interval: Number) -> tuple[Number, Number, Number]:
+        """What is left of the velocity after an interval, its reach, and the process noise."""
+        return self.decay**interval, self.reach(interval), self.q * (interval * interval)
+
     def gain(
-        self, covariance: Covariance[Number], interval: Number
+        self, covariance: Covariance[Number], keep: Number, reach: Number, noise: Number
     ) -> tuple[Covariance[Number], Number, Number]:
         """Predict the covariance over an interval and update it with a measurement.
 
         Args:
             covariance: of a position with itself, with its velocity, and of the velocity.
-            interval: dt in frames.
+            keep, reach, noise: the :meth:`transition` over the interval.
 
         Returns:
             The new covariance, and the gains of position and velocity (Eqs. 7-9).
         """
         a, b, c = covariance
-        keep, reach = self.decay**interval, self.reach(interval)
-        noise = self.q * (interval * interval)
         a = a + 2.0 * reach * b + reach * reach * c + noise
         b = keep * (b + reach * c)
         c = keep * keep * c + noise
@@ -154,8 +156,10 @@ class Kalman:
         """Take in the box of a newer frame."""
         interval = float(frame - self._frame)
         predicted = self._extrapolate(frame)
-        self._covariance, position, velocity = self._settings.gain(self._covariance, interval)
-        kept = self._settings.decay**interval
+        kept, reach, noise = self._settings.transition(interval)
+        self._covariance, position, velocity = self._settings.gain(
+            self._covariance, kept, reach, noise
+        )
         errors = [measured - p for measured, p in zip(self._measured(box), predicted)]
         self._position = [p + position * error for p, error in zip(predicted, errors)]
         self._velocity = [kept * v + velocity * e for v, e in zip(self._velocity, errors)]
@@ -236,7 +240,8 @@ def filter_lanes(
 ) -> tuple[Floats, Floats]:
     """Filter all lanes in step: the k-th update of every lane that has one, for each k.
 
-    Lanes are sorted by length, so that those still running are always the first ones.
+    Lanes are sorted by length, so that those still running are always the first ones, and items by
+    their place in the lane, so that each step works on one stretch of memory.
 
     Args:
         lanes: what the filters are fed.
@@ -247,30 +252,36 @@ def filter_lanes(
         Position and velocity of the state after each item, float64 [N, 4] each.
     """
     lengths = np.diff(lanes.offsets)
-    order = np.argsort(-lengths, kind="stable")
-    firsts, lengths = lanes.offsets[:-1][order], lengths[order]
-    states = settings.states(lanes.boxes)
-    position = states[firsts]
-    velocity = np.zeros_like(position)
+    longest = np.argsort(-lengths, kind="stable")
+    running = np.searchsorted(-lengths[longest], -np.arange(lengths.max()))  # with more than k
+    place = np.repeat(np.arange(lengths.max()), running)  # k, for each item in the new order
+    ends = np.cumsum(running)
+    lane = np.arange(ends[-1]) - np.repeat(ends - running, running)
+    order = lanes.offsets[:-1][longest][lane] + place
+    interval = np.zeros(len(order))
+    later = order[running[0] :]
+    interval[running[0] :] = lanes.frames[later] - lanes.frames[later - 1]
+    keep, reach, noise = (np.asarray(each, np.float64) for each in settings.transition(interval))
+    measured = np.ascontiguousarray(settings.states(lanes.boxes)[order].T)
+    positions, velocities = measured.copy(), np.zeros_like(measured)
     start = (settings.p0, 0.0, settings.p0)
-    a, b, c = (np.full(len(order), value, np.float64) for value in start)
-    positions, velocities = states.copy(), np.zeros_like(states)
-    running = np.searchsorted(-lengths, -np.arange(lengths[0]))  # lanes with more than k outputs
-    for k in range(1, int(lengths[0])):
-        n = int(running[k])
-        item = firsts[:n] + k
-        interval = (lanes.frames[item] - lanes.frames[item - 1]).astype(np.float64)
-        measured = states[item]
-        covariance, position_gain, velocity_gain = settings.gain((a[:n], b[:n], c[:n]), interval)
-        predicted = position[:n] + settings.reach(interval)[:, None] * velocity[:n]
-        kept = (settings.decay**interval)[:, None]
-        error = measured - predicted
-        position[:n] = predicted + position_gain[:, None] * error
-        velocity[:n] = kept * velocity[:n] + velocity_gain[:, None] * error
-        a[:n], b[:n], c[:n] = covariance
+    covariance = tuple(np.full(running[0], value, np.float64) for value in start)
+    position, velocity = positions[:, : running[0]], velocities[:, : running[0]]
+    for n, end in zip(running[1:].tolist(), ends[1:].tolist()):
+        now = slice(end - n, end)
+        kept, reached = keep[now], reach[now]
+        a, b, c = (each[:n] for each in covariance)
+        covariance, gain, velocity_gain = settings.gain((a, b, c), kept, reached, noise[now])
+        predicted = position[:, :n] + reached * velocity[:, :n]
+        error = measured[:, now] - predicted
+        position = np.add(predicted, gain * error, out=positions[:, now])
+        faster = kept * velocity[:, :n]
+        velocity = np.add(faster, velocity_gain * error, out=velocities[:, now])
         if restart_iou is not None:
-            lost = np.flatnonzero(iou(predicted, measured) < restart_iou)
-            position[lost], velocity[lost] = measured[lost], 0.0
-            a[lost], b[lost], c[lost] = start
-        positions[item], velocities[item] = position[:n], velocity[:n]
-    return positions, velocities
+            lost = np.flatnonzero(iou(predicted.T, measured[:, now].T) < restart_iou)
+            position[:, lost], velocity[:, lost] = measured[:, now][:, lost], 0.0
+            for each, value in zip(covariance, start):
+                each[lost] = value
+    found = np.empty((2, len(order), 4))
+    found[0, order], found[1, order] = positions.T, velocities.T
+    return found[0], found[1]

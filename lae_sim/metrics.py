@@ -147,13 +147,13 @@ def frame_counts(
     overlap = np.where(valid, iou(truth, answers), -1.0)
     success = np.searchsorted(convention.iou_thresholds, overlap)  # thresholds t < IoU
 
-    offset = centre(answers) - centre(truth)
+    x, y = np.ascontiguousarray((centre(answers) - centre(truth)).T)
     valid_centre = convention.valid_precision(truth)
     invalid_error = np.inf if convention.leaves_out else -1.0
-    error = np.where(valid_centre, _length(offset), invalid_error)
-    sized = np.where(truth[:, 2:] > 0, truth[:, 2:], np.nan)
+    error = np.where(valid_centre, _length(x, y), invalid_error)
+    w, h = np.ascontiguousarray(np.where(truth[:, 2:] > 0, truth[:, 2:], np.nan).T)
     with np.errstate(over="ignore"):  # a truth of almost no size: an infinite error is a miss
-        norm_error = np.where(valid_centre, _length(offset / sized), invalid_error)
+        norm_error = np.where(valid_centre, _length(x / w, y / h), invalid_error)
     norm_error = np.where(np.isnan(norm_error), np.inf, norm_error)
     most = len(CENTRE_THRESHOLDS)
     whole = np.ceil(np.fmin(np.maximum(error, 0), most))  # fmin: an error of NaN passes none
@@ -167,12 +167,15 @@ def frame_counts(
 
 
 def _all(flags: Bools) -> Bools:
-    every: Bools = np.logical_and.reduce(flags, axis=1)
+    """Where all columns hold."""
+    every = flags[:, 0].copy()
+    for column in flags.T[1:]:
+        every &= column
     return every
 
 
-def _length(vectors: Floats) -> Floats:
-    length: Floats = np.sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2)
+def _length(x: Floats, y: Floats) -> Floats:
+    length: Floats = np.sqrt(x**2 + y**2)
     return length
 
 
@@ -198,7 +201,7 @@ def precision_curve(truth: Floats, answers: Floats, convention: Convention) -> F
     if convention.first_frame_is_truth:
         answers = np.concatenate([truth[:1], answers[1:]])
     valid = convention.valid_precision(truth)
-    error = np.where(valid, _length(centre(answers) - centre(truth)), -1.0)
+    error = np.where(valid, _length(*(centre(answers) - centre(truth)).T), -1.0)
     if convention.leaves_out:
         error = error[valid]
     curve: Floats = (error[:, None] <= CENTRE_THRESHOLDS).sum(axis=0) / (len(error) or np.nan)

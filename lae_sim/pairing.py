@@ -238,11 +238,19 @@ def pairs(pairing: Pairing, fed: Histories) -> Pairs:
     frame = ranges(begin, sizes)
     output = fed.output[item]
     query = pairing.scale * frame
-    visible = np.searchsorted(pairing.sigmas, pairing.steps[output] - query)
-    hidden = np.searchsorted(pairing.sigmas, pairing.next_steps[output] - query)
+    visible = _place(pairing.sigmas, pairing.steps[output] - query)
+    hidden = _place(pairing.sigmas, pairing.next_steps[output] - query)
     sigma_from, sigma_to = np.maximum(visible, low[item]), np.minimum(hidden, high[item])
     some = sigma_from < sigma_to
     return Pairs(item[some], frame[some], sigma_from[some], sigma_to[some])
+
+
+def _place(sigmas: Ints, values: Ints) -> Ints:
+    """How many sigmas are below each value."""
+    if sigmas[-1] - sigmas[0] == len(sigmas) - 1:  # one after another, as on the usual grid
+        place: Ints = np.clip(values - sigmas[0], 0, len(sigmas))
+        return place
+    return np.searchsorted(sigmas, values)
 
 
 def ranges(starts: Ints, sizes: Ints) -> Ints:

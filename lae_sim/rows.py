@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lae_sim.arrow import from_numpy, is_null, to_numpy
+from lae_sim.arrow import from_numpy, from_texts, is_null, to_numpy
 from lae_sim.boxes import Bools, Floats
 from lae_sim.engine import Ints
 from lae_sim.recording import Recording
@@ -99,7 +99,7 @@ class Rows:
         import pyarrow as pa
 
         codes = np.repeat(np.arange(len(self.names), dtype=np.int32), np.diff(self.starts))
-        names = pa.DictionaryArray.from_arrays(from_numpy(codes), pa.array(self.names, pa.string()))
+        names = pa.DictionaryArray.from_arrays(from_numpy(codes), from_texts(self.names))
         columns = [
             names.cast(pa.string()),
             from_numpy(self.frame.astype(np.int32)),
@@ -125,7 +125,7 @@ def _boxes(column: dict[str, Any], names: tuple[str, ...], n: int) -> tuple[Floa
     null = np.ones((n, 4), np.bool_)
     for i, name in enumerate(names):
         if name in column:
+            values = to_numpy(column[name], np.float64)
             null[:, i] = is_null(column[name])
-            valid = ~null[:, i]
-            boxes[valid, i] = to_numpy(column[name], np.float64)[valid]
+            boxes[:, i] = np.where(null[:, i], np.nan, values) if null[:, i].any() else values
     return boxes, null

@@ -225,7 +225,7 @@ def _write(results: StudyResults) -> None:
         else:
             path.unlink(missing_ok=True)
     with written_whole(results.folder / "study.json") as temporary:
-        temporary.write_text(json.dumps(results.document(), indent=1, allow_nan=False))
+        temporary.write_text(json.dumps(results.document(), allow_nan=False))
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> None:

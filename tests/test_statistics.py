@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import wilcoxon
+from scipy.stats import rankdata, wilcoxon
 
 from lae_sim import statistics
 from lae_sim.errors import LaeError
@@ -83,7 +84,8 @@ def test_golden_values_of_a_plain_bootstrap():
     assert found["vs_hold"] == pytest.approx(m - h)
     assert found["vs_kalman"] == pytest.approx(m - k)
     assert found["recovered"] == pytest.approx((m - h) / (o - h))
-    assert found["vs_kalman_p"] == wilcoxon(scores["mine"], scores["kalman"]).pvalue
+    expected = wilcoxon(scores["mine"], scores["kalman"]).pvalue
+    assert found["vs_kalman_p"] == pytest.approx(expected, rel=1e-12)
     assert found["vs_kalman_better"] == sum(scores["mine"] > scores["kalman"])
     assert found["vs_kalman_worse"] == sum(scores["mine"] < scores["kalman"])
 
@@ -103,11 +105,27 @@ def test_signed_ranks_counted_by_hand(differences, p):
     assert signed_rank_p(np.array(differences)) == pytest.approx(p)
 
 
-def test_signed_ranks_of_many_or_tied_differences_are_normal():
-    for differences in (np.linspace(-0.5, 1, 60), np.repeat([0.1, 0.2, -0.1, 0.3], 4)):
+def test_signed_ranks_of_many_differences_are_normal_as_those_of_scipy():
+    for differences in (np.linspace(-0.5, 1, 60), np.repeat([0.1, 0.2, -0.1, 0.3], 14)):
         expected = wilcoxon(differences, method="approx").pvalue
-        assert signed_rank_p(differences) == expected
-        assert signed_rank_p(np.append(differences, [0, 0])) == expected
+        assert signed_rank_p(differences) == pytest.approx(expected, rel=1e-12)
+        assert signed_rank_p(np.append(differences, [0, 0])) == signed_rank_p(differences)
+
+
+def test_signed_ranks_without_ties_are_exact_as_those_of_scipy():
+    for count in (10, 25, 50):
+        differences = np.random.default_rng(count).normal(0.3, 1, count)
+        expected = wilcoxon(differences, method="exact").pvalue
+        assert signed_rank_p(differences) == pytest.approx(expected, rel=1e-12)
+
+
+def test_ties_are_exact_by_trying_all_signs():
+    for differences in ([0.1, 0.1, -0.2, 0.3, 0.3, 0.3, -0.1], np.repeat([0.1, 0.2, -0.1], 4)):
+        ranks = rankdata(np.abs(differences))
+        signs = np.array(list(product((0, 1), repeat=len(ranks))))
+        sums, found = signs @ ranks, ranks[np.array(differences) > 0].sum()
+        tail = min((sums <= found).mean(), (sums >= found).mean())
+        assert signed_rank_p(np.array(differences)) == pytest.approx(min(1, 2 * tail))
 
 
 def test_ties_of_differences_survive_rounding_errors():
