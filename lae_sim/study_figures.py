@@ -19,24 +19,12 @@ from lae_sim.clock import parse_duration
 from lae_sim.metrics import CENTRE_THRESHOLDS
 from lae_sim.plots import new_figure
 from lae_sim.study_summary import MEAN, Row, Scores
-from lae_sim.study_tables import (
-    names,
-    reference,
-    referred,
-    run_of,
-    scores_row,
-    setting_of,
-    told_setting,
-    whole_rows,
-)
 from lae_sim.study_text import SETTINGS
+from lae_sim.study_view import View, row_of, run_of, setting_of, told_setting
 from lae_sim.tabular import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from pandas import DataFrame
-
-    from lae_sim.study_run import StudyResults
 
 MOST_CURVES, MOST_PAIRS, MOST_BARS, MOST_HISTOGRAMS = 8, 6, 30, 30
 """What one picture holds of curves, rows and histograms, and how many curve pictures there are."""
@@ -60,49 +48,32 @@ class Picture:
     svg: bytes
 
 
-@dataclass(frozen=True)
-class Look:
-    """What is told apart by what.
+def _style(view: View, run: str, forecaster: str = "hold") -> dict[str, Any]:
+    """Colour and mark of the tracker, line of the forecaster."""
+    place, n = list(dict.fromkeys(view.names.values())).index(view.names[run]), len(_COLOURS)
+    return {
+        "color": _COLOURS[place % n],
+        "marker": _MARKS[(place + place // n) % len(_MARKS)],
+        "linestyle": _line(view, forecaster),
+        "markersize": 4,
+    }
 
-    Attributes:
-        names: of the runs.
-        forecasters: names, hold first.
-    """
 
-    names: dict[str, str]
-    forecasters: tuple[str, ...]
+def _line(view: View, forecaster: str) -> Any:
+    """Hold is dotted, and offline, which is no forecaster, dashed."""
+    place = view.forecasters.index(forecaster)
+    return _LINES[(place - 1) % len(_LINES)] if place else ":"
 
-    @classmethod
-    def of(cls, results: StudyResults) -> Look:
-        """The look of a study."""
-        rows = results.summary
-        return cls(names(rows), tuple(dict.fromkeys(row["forecaster"] for row in rows)))
 
-    def style(self, run: str, forecaster: str = "hold") -> dict[str, Any]:
-        """Colour and mark of the tracker, line of the forecaster."""
-        place = list(dict.fromkeys(self.names.values())).index(self.names[run])
-        n = len(_COLOURS)
-        return {
-            "color": _COLOURS[place % n],
-            "marker": _MARKS[(place + place // n) % len(_MARKS)],
-            "linestyle": self.line(forecaster),
-            "markersize": 4,
-        }
-
-    def line(self, forecaster: str) -> Any:
-        """Hold is dotted; offline, dashed, is no forecaster."""
-        place = self.forecasters.index(forecaster)
-        return ":" if forecaster == "hold" else _LINES[(place - 1) % len(_LINES)]
-
-    def best(self, rows: Sequence[Row]) -> tuple[list[Row], str]:
-        """The rows of the best trackers, as many as a panel may hold, and what was left out."""
-        best: dict[str, float] = {}
-        for row in rows:
-            best[run_of(row)] = max(best.get(run_of(row), 0), row["auc"] or 0)
-        shown = max(1, MOST_CURVES // len(self.forecasters))
-        kept = sorted(best, key=lambda run: -best[run])[:shown]
-        told = f"the best {len(kept)} of {len(best)} trackers" if len(kept) < len(best) else ""
-        return [row for row in rows if run_of(row) in kept], told
+def _best(view: View, rows: Sequence[Row]) -> tuple[list[Row], str]:
+    """The rows of the best trackers, as many as a panel may hold, and what was left out."""
+    best: dict[str, float] = {}
+    for row in rows:
+        best[run_of(row)] = max(best.get(run_of(row), 0), row["auc"] or 0)
+    shown = max(1, MOST_CURVES // len(view.forecasters))
+    kept = sorted(best, key=lambda run: -best[run])[:shown]
+    told = f"; the best {len(kept)} of {len(best)} trackers" if len(kept) < len(best) else ""
+    return [row for row in rows if run_of(row) in kept], told
 
 
 def drawn(caption: str, draw: Callable[[], Figure]) -> Picture:
@@ -139,26 +110,21 @@ def _below(figure: Figure, columns: int = 4) -> None:
     figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=columns)
 
 
-def curves(results: StudyResults, look: Look) -> Iterator[Picture]:
+def curves(view: View) -> Iterator[Picture]:
     """Success and precision of each dataset, at the settings that stand for all, then others."""
-    chosen = reference(results.summary)
     groups: dict[tuple[Any, ...], list[Scores]] = {}
-    for scores in results.scores:
+    for scores in view.results.scores:
         groups.setdefault(scores.group, []).append(scores)
-
-    def stands(group: list[Scores]) -> bool:
-        return any(chosen[run_of(row)] == setting_of(row) for row in map(scores_row, group))
-
-    ordered = sorted(groups.values(), key=lambda group: not stands(group))
+    ordered = sorted(
+        groups.values(), key=lambda group: not any(view.stands(row_of(s)) for s in group)
+    )
     for group in ordered[:MOST_PAIRS]:
-        rows = [
-            {**scores_row(s), "sigma": str(s.setting.sigmas[0]), "auc": _mean(s), "scores": s}
-            for s in group
-        ]
-        rows, told = look.best(rows)
-        what = f"{printable(rows[0]['dataset'])}: {told_setting(rows)}"
-        caption = f"{what}{'; ' * bool(told)}{told}. In brackets: AUC, and precision at 20 px."
-        yield drawn(caption, lambda rows=rows: _curves(rows, look))  # type: ignore[misc]
+        rows, told = _best(view, [{**row_of(s), "auc": _mean(s), "scores": s} for s in group])
+        what = f"{printable(rows[0]['dataset'])}: {told_setting(rows)}{told}"
+        yield drawn(
+            f"{what}. In brackets: AUC, and precision at 20 px.",
+            lambda rows=rows: _curves(view, rows),  # type: ignore[misc]
+        )
     if len(ordered) > MOST_PAIRS:
         left = len(ordered) - MOST_PAIRS
         yield Picture(f"{left} more settings are in the ranking, and not drawn here.", b"")
@@ -169,15 +135,15 @@ def _mean(scores: Scores) -> float:
     return float(np.nanmean(known)) if (known == known).any() else 0.0
 
 
-def _curves(rows: Sequence[Row], look: Look) -> Figure:
+def _curves(view: View, rows: Sequence[Row]) -> Figure:
     figure = new_figure(10, 4.2 + 0.17 * len(rows) / 2)
     left, right = figure.subplots(1, 2)
     for row in rows:
         run, forecaster = run_of(row), row["forecaster"]
-        style = {**look.style(run, forecaster), "marker": ""}
-        lines = [(f"{look.names[run]}, {printable(forecaster)}", "", style)]
+        style = {**_style(view, run, forecaster), "marker": ""}
+        lines = [(f"{view.names[run]}, {printable(forecaster)}", "", style)]
         if forecaster == "hold":
-            lines.insert(0, (f"{look.names[run]}, offline", "offline_", {**style, "ls": "--"}))
+            lines.insert(0, (f"{view.names[run]}, offline", "offline_", {**style, "ls": "--"}))
         for name, which, style in lines:
             style.pop("linestyle" if which else "", None)
             means = [about["curves"] for about in row["scores"].about]
@@ -205,27 +171,23 @@ SWEEPS = {
 """What scores are drawn over, if a study has several: the key of the summary, and its label."""
 
 
-def sweep(results: StudyResults, look: Look, key: str) -> Picture | None:
+def sweep(view: View, key: str) -> Picture | None:
     """AUC and DP of each dataset over a key of ``SWEEPS``; None if it has one value only."""
-    chosen = reference(results.summary)
-    rows = [*results.summary] if key == "sigma" else whole_rows(results)
     points = []
-    for row in rows:
-        alike = zip(SETTINGS[1:], setting_of(row), chosen[run_of(row)])
+    for row in view.results.summary if key == "sigma" else view.rows:
+        alike = zip(SETTINGS[1:], setting_of(row), view.chosen[run_of(row)])
         x = _place(key, row[key])
         if x is not None and all(ours == its for name, ours, its in alike if name != key):
             points.append({**row, "x": x})
     if len({row["x"] for row in points}) < 2:
         return None
     datasets = list(dict.fromkeys(row["dataset"] for row in points))
-    kept, left_out = [], []
+    kept, caption = [], f"Over {SWEEPS[key].split(' (')[0]}: {told_setting(view.standing, but=key)}"
     for dataset in datasets:
-        best, told = look.best([row for row in points if row["dataset"] == dataset])
+        best, told = _best(view, [row for row in points if row["dataset"] == dataset])
         kept += best
-        left_out += [f"{printable(dataset)}: {told}"] if told else []
-    told = told_setting(referred(rows), but=key)
-    caption = "; ".join([f"Over {SWEEPS[key].split(' (')[0]}. {told.capitalize()}", *left_out])
-    return drawn(caption, lambda: _sweep(kept, datasets, key, look))
+        caption += told and f"{told} on {printable(dataset)}"
+    return drawn(caption, lambda: _sweep(view, kept, datasets, key))
 
 
 def _place(key: str, value: str) -> float | None:
@@ -236,7 +198,7 @@ def _place(key: str, value: str) -> float | None:
     return None if value == MEAN else float(Fraction(value))
 
 
-def _sweep(rows: Sequence[Row], datasets: Sequence[str], key: str, look: Look) -> Figure:
+def _sweep(view: View, rows: Sequence[Row], datasets: Sequence[str], key: str) -> Figure:
     figure = new_figure(10, 0.8 + 2.7 * len(datasets))
     panels = figure.subplots(len(datasets), 2, squeeze=False, sharex=True)
     mean = "m" if rows[0]["sigma"] == MEAN else ""
@@ -248,9 +210,9 @@ def _sweep(rows: Sequence[Row], datasets: Sequence[str], key: str, look: Look) -
         for axes, metric, label in zip(pair, ("auc", "dp20"), (f"{mean}AUC", f"{mean}DP")):
             for (run, forecaster), its in lines.items():
                 its = sorted(its, key=lambda row: row["x"])
-                style = look.style(run, forecaster) | ({"marker": ""} if len(its) > 12 else {})
+                style = _style(view, run, forecaster) | ({"marker": ""} if len(its) > 12 else {})
                 ys = [np.nan if row[metric] is None else row[metric] for row in its]
-                name = f"{look.names[run]}, {printable(forecaster)}"
+                name = f"{view.names[run]}, {printable(forecaster)}"
                 axes.plot([row["x"] for row in its], ys, label=name, **style)
             axes.set(ylabel=label, title=printable(dataset))
             if axes.get_subplotspec().is_last_row():
@@ -264,14 +226,14 @@ def _sweep(rows: Sequence[Row], datasets: Sequence[str], key: str, look: Look) -
     return figure
 
 
-def front(results: StudyResults, look: Look) -> Picture:
+def front(view: View) -> Picture:
     """AUC against the time of a call, and the Pareto front of each dataset and forecaster."""
-    rows = [row for row in referred(whole_rows(results)) if row["auc"] is not None]
-    caption = "AUC against the mean time of a call; lines join what no other tracker beats in both"
-    return drawn(f"{caption}. {told_setting(rows).capitalize()}", lambda: _front(rows, look))
+    rows = [row for row in view.standing if row["auc"] is not None]
+    caption = "AUC against the mean time of a call; hollow: hold; lines join what no other tracker"
+    return drawn(f"{caption} beats in both: {told_setting(rows)}", lambda: _front(view, rows))
 
 
-def _front(rows: Sequence[Row], look: Look) -> Figure:
+def _front(view: View, rows: Sequence[Row]) -> Figure:
     datasets = list(dict.fromkeys(row["dataset"] for row in rows))
     columns = min(len(datasets), 2)
     lines = -(-len(datasets) // columns)
@@ -279,60 +241,63 @@ def _front(rows: Sequence[Row], look: Look) -> Figure:
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes, dataset in zip(panels, datasets):
         ours = [row for row in rows if row["dataset"] == dataset]
-        for forecaster in look.forecasters:
+        for forecaster in view.forecasters:
             its = sorted(
                 (row for row in ours if row["forecaster"] == forecaster and row["pareto"]),
                 key=lambda row: row["elapsed_ms"],
             )
             xs, ys = [row["elapsed_ms"] for row in its], [row["auc"] for row in its]
-            style = {"color": "0.45", "linestyle": look.line(forecaster), "zorder": 1}
+            style = {"color": "0.45", "linestyle": _line(view, forecaster), "zorder": 1}
             axes.plot(xs, ys, label=f"front, {printable(forecaster)}", **style)
         for row in ours:
             filled = "full" if row["forecaster"] != "hold" else "none"
-            style = {**look.style(run_of(row)), "linestyle": "", "fillstyle": filled}
+            style = {**_style(view, run_of(row)), "linestyle": "", "fillstyle": filled}
             axes.plot(row["elapsed_ms"], row["auc"], **{**style, "markersize": 7})
         axes.margins(x=0.2, y=0.1)
         best: dict[str, Row] = {}
         for row in sorted(ours, key=lambda row: row["auc"]):
             best[run_of(row)] = row
-        # a label beside each tracker's best point, moved up where the one below is too near
-        low, high = axes.get_ylim()
-        least, below = 0.055 * (high - low), -np.inf
+        # a label beside each tracker's best point, moved up where one is too near below
+        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+        taken: list[tuple[float, float]] = []
         for run, row in best.items():
-            below = max(row["auc"], below + least)
-            place = (row["elapsed_ms"], below)
-            axes.annotate(
-                look.names[run], place, (8, 0), textcoords="offset points", va="center", fontsize=8
-            )
+            x, y, least = row["elapsed_ms"], row["auc"], 0.055 * (high - low)
+            for other, height in taken:
+                if abs(other - x) < 0.4 * (right - left):
+                    y = max(y, height + least)
+            taken.append((x, y))
+            aside: dict[str, Any] = {"xytext": (8, 0), "ha": "left"}
+            if x > (left + right) / 2:
+                aside = {"xytext": (-8, 0), "ha": "right"}
+            label = {"textcoords": "offset points", "va": "center", "fontsize": 8, **aside}
+            axes.annotate(view.names[run], (x, y), **label)
         axes.set(xlabel="mean time of a call (ms)", ylabel="AUC", title=printable(dataset))
-        axes.set_ylim(low, max(high, below + least))
+        axes.set_ylim(low, max(high, *(y + 0.05 * (high - low) for _, y in taken)))
     for axes in panels[len(datasets) :]:
         axes.remove()
     _below(figure)
     return figure
 
 
-def gains(results: StudyResults, look: Look) -> Picture | None:
+def gains(view: View) -> Picture | None:
     """What each forecaster wins over hold for each tracker; None if there is only hold."""
-    rows = [row for row in referred(whole_rows(results)) if "vs_hold_auc_low" in row]
+    rows = [row for row in view.standing if "vs_hold_auc_low" in row]
     if not rows:
         return None
-    runs = sorted({run_of(row) for row in rows}, key=list(look.names).index)
-    best = {run: max(row["vs_hold_auc"] for row in rows if run_of(row) == run) for run in runs}
-    kept = sorted(runs, key=lambda run: -best[run])[:MOST_BARS]
-    told = f"; the {len(kept)} largest of {len(runs)}" if len(kept) < len(runs) else ""
-    caption = (
-        f"What forecasters win over hold, with 95 % intervals over sequences{told}. "
-        + told_setting(rows).capitalize()
-    )
-    kept_rows = [row for row in rows if run_of(row) in kept]
-    return drawn(caption, lambda: _gains(kept_rows, kept, look))
+    best: dict[str, float] = {}
+    for row in rows:
+        best[run_of(row)] = max(best.get(run_of(row), -1), row["vs_hold_auc"])
+    kept = sorted(best, key=lambda run: -best[run])[:MOST_BARS]
+    told = f", the {len(kept)} largest of {len(best)}" if len(kept) < len(best) else ""
+    caption = f"What forecasters win over hold{told}, with 95 % intervals over sequences"
+    rows = [row for row in rows if run_of(row) in kept]
+    return drawn(f"{caption}: {told_setting(rows)}", lambda: _gains(view, rows, kept))
 
 
-def _gains(rows: Sequence[Row], runs: Sequence[str], look: Look) -> Figure:
+def _gains(view: View, rows: Sequence[Row], runs: Sequence[str]) -> Figure:
     figure = new_figure(10, 1.3 + 0.3 * len(runs) + 0.1 * len(rows))
     panels = figure.subplots(1, 2, sharey=True)
-    rivals = [name for name in look.forecasters if name != "hold"]
+    rivals = [name for name in view.forecasters if name != "hold"]
     datasets = {run_of(row): printable(row["dataset"]) for row in rows}
     several = len(set(datasets.values())) > 1
     for axes, key, factor in zip(panels, ("vs_hold_auc", "recovered_auc"), (1, 100)):
@@ -356,30 +321,31 @@ def _gains(rows: Sequence[Row], runs: Sequence[str], look: Look) -> Figure:
     panels[1].set_xlim(max(low, -100), min(high, 150))  # where little was lost, intervals are wide
     panels[0].set_yticks(
         range(len(runs)),
-        [look.names[r] + (f" ({datasets[r]})" if several else "") for r in runs],
+        [view.names[r] + (f" ({datasets[r]})" if several else "") for r in runs],
     )
     _below(figure)
     return figure
 
 
-def attributes(summary: DataFrame) -> Iterator[Picture]:
+def attributes(view: View) -> Iterator[Picture]:
     """Gains on the sequences of each attribute, all trackers of a dataset together."""
     from lae_sim.comparison_plots import attribute_bars
 
-    for dataset, group in summary.groupby("dataset", sort=False):
-        known = group["recovered"].notna().any()
-        rivals = group["forecaster"].nunique() > 2
-        value = "recovered" if known and rivals else "mean"
+    if view.attributes is None:
+        return
+    for dataset, group in view.attributes.groupby("dataset", sort=False):
+        value = "recovered" if group["recovered"].notna().any() else "mean"
+        what = "share of the latency loss recovered" if value == "recovered" else "AUC"
         yield drawn(
-            f"{dataset}: " + ("share of the latency loss recovered" if known else "AUC")
-            + " on the sequences of each attribute (n of them), with 95 % intervals",
+            f"{dataset}: {what} on the sequences of each attribute (n of them), with 95 % "
+            "intervals where they are known; at the first sigma",
             lambda group=group, value=value: attribute_bars(group, "auc", value),  # type: ignore[misc]
-        )  # fmt: skip
+        )
 
 
-def histograms(results: StudyResults) -> Picture | None:
+def histograms(view: View) -> Picture | None:
     """How long the calls of each trace took."""
-    traces = [trace for trace in results.traces if trace["times"]["histogram"]]
+    traces = [trace for trace in view.results.traces if trace["times"]["histogram"]]
     if not traces:
         return None
     shown = traces[:MOST_HISTOGRAMS]

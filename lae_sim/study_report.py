@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 from lae_sim import __version__, study_figures, study_tables
 from lae_sim.files import written_whole
 from lae_sim.metrics import CONVENTIONS, Convention
-from lae_sim.study_figures import SWEEPS, Look, Picture
+from lae_sim.study_figures import SWEEPS, Picture
 from lae_sim.study_tables import LEGEND
+from lae_sim.study_text import primary
+from lae_sim.study_view import View
 from lae_sim.tabular import Entry, Table, printable
 
 if TYPE_CHECKING:
@@ -112,6 +114,12 @@ function sortable(table) {
 if (typeof document !== "undefined") document.querySelectorAll("table.sortable").forEach(sortable);
 """
 
+_PAIRS = (
+    "<p><i>a better here</i>: probability that one run of a beats one of b on these sequences; "
+    "<i>a better</i>: on others like them. p: Wilcoxon's signed-rank test; Holm: corrected for the "
+    "number of pairs of a setting.</p>"
+)
+
 Section = tuple[str, str, Iterable[str]]
 
 
@@ -133,7 +141,7 @@ def page(results: StudyResults) -> str:
     """The report's HTML."""
     sections = [
         (anchor, title, text)
-        for anchor, title, parts in _sections(results)
+        for anchor, title, parts in _sections(View(results))
         if (text := "\n".join(parts))
     ]
     contents = "".join(f'<li><a href="#{a}">{escape(t)}</a></li>' for a, t, _ in sections)
@@ -169,7 +177,7 @@ def page(results: StudyResults) -> str:
 
 def _facts(results: StudyResults) -> str:
     """What was studied, in a few lines."""
-    rows, study = results.summary, results.plan.study
+    rows, study = primary(results.summary), results.plan.study
     shares = [row["approximate_share"] for row in rows if not row["exact"]]
     told = "every replay is exact"
     if shares:
@@ -191,57 +199,46 @@ def _facts(results: StudyResults) -> str:
     return _pairs(facts)
 
 
-def _sections(results: StudyResults) -> Iterator[Section]:
-    look = Look.of(results)
-    attributes = study_tables.attribute_summary(results)
-    ranking = study_tables.ranking(results)
+def _sections(view: View) -> Iterator[Section]:
+    results = view.results
+    ranking = study_tables.ranking(view)
     meanings = {title: LEGEND[title] for title in ranking.header if title in LEGEND}
-    yield "failures", "Failures", _failures(results.failures)
     columns = f"<details><summary>What the columns mean</summary>{_pairs(meanings)}</details>"
+    yield "failures", "Failures", _list([f"{f['of']}: {f['reason']}" for f in results.failures])
     yield "ranking", "Ranking", [columns, _table(ranking)]
-    yield "table2", "With and without forecasters", [_table(study_tables.table2(results))]
-    yield "curves", "Success and precision", map(_figure, study_figures.curves(results, look))
-    swept = (study_figures.sweep(results, look, key) for key in SWEEPS)
+    yield "table2", "With and without forecasters", [_table(study_tables.table2(view))]
+    yield "curves", "Success and precision", _figures(study_figures.curves(view))
+    swept = (study_figures.sweep(view, key) for key in SWEEPS)
     yield "sweeps", "Over permitted latency, speed and rate", _figures(swept)
-    yield "front", "Accuracy against time", _figures([study_figures.front(results, look)])
-    yield "gains", "What forecasters win", _figures([study_figures.gains(results, look)])
-    if attributes is not None:
-        yield (
-            "attributes",
-            "Attributes",
-            [
-                *map(_figure, study_figures.attributes(attributes)),
-                _table(study_tables.attribute_table(attributes)),
-            ],
-        )
+    yield "front", "Accuracy against time", _figures([study_figures.front(view)])
+    yield "gains", "What forecasters win", _figures([study_figures.gains(view)])
+    if table := study_tables.attribute_table(view):
+        shown = [*_figures(study_figures.attributes(view)), _table(table)]
+        yield "attributes", "Attributes", shown
     if results.comparisons:
-        note = (
-            "<p><i>a better here</i>: probability that one run of a beats one of b on these "
-            "sequences; <i>a better</i>: on others like them. p: Wilcoxon's signed-rank test; "
-            "Holm: corrected for the number of pairs of a setting.</p>"
-        )
-        table = _table(study_tables.comparison_table(results))
-        yield "comparisons", "Trackers against each other", [note, table]
+        shown = [_PAIRS, _table(study_tables.comparison_table(view))]
+        yield "comparisons", "Trackers against each other", shown
     if results.required:
-        yield (
-            "required",
-            "What the required AUC asks for",
-            [_table(study_tables.required_table(results))],
-        )
-    yield "times", "Processing times", _times(results)
+        shown = [_table(study_tables.required_table(view))]
+        yield "required", "What the required AUC asks for", shown
+    pictures = _figures([study_figures.histograms(view)])
+    yield "times", "Processing times", [*pictures, _table(_times(results))]
     yield "traces", "Traces", map(_provenance, results.traces)
-    yield "conventions", "Conventions", [_conventions(results)]
-    notes = "".join(f"<li>{escape(printable(note))}</li>" for note in results.notes())
-    yield "notes", "Notes", [f"<ul>{notes}</ul>"] if notes else []
-    study = json.dumps(results.plan.study.document(), indent=1, sort_keys=True)
-    yield "study", "The study", [f"<pre>{escape(study)}</pre>"]
+    used = dict.fromkeys(row["convention"] for row in results.summary)
+    told = {name: told_convention(CONVENTIONS[name]) for name in used}
+    yield "conventions", "Conventions", [_pairs(told)]
+    yield "notes", "Notes", _list(results.notes())
+    yield "study", "The study", [_json(results.plan.study.document())]
 
 
-def _failures(failures: Sequence[dict[str, Any]]) -> Iterator[str]:
-    if failures:
-        lines = (f"<li>{escape(printable(f['of']))}: {escape(printable(f['reason']))}</li>"
-                 for f in failures)  # fmt: skip
-        yield f'<ul class="warning">{"".join(lines)}</ul>'
+def _list(texts: Sequence[str], kind: str = "") -> list[str]:
+    items = "".join(f"<li{kind}>{escape(printable(text))}</li>" for text in texts)
+    return [f"<ul>{items}</ul>"] if items else []
+
+
+def _json(document: Any) -> str:
+    text = json.dumps(document, indent=1, sort_keys=True, ensure_ascii=False)
+    return f"<pre>{escape(text)}</pre>"
 
 
 def _figures(pictures: Iterable[Picture | None]) -> Iterator[str]:
@@ -306,36 +303,24 @@ def _pairs(facts: dict[str, str]) -> str:
     return f"<dl>{''.join(told)}</dl>"
 
 
-def _times(results: StudyResults) -> Iterator[str]:
-    yield from _figures([study_figures.histograms(results)])
-    header = ("trace", "calls", "median ms", "p95", "p99", "longest", "slower than frames")
+def _times(results: StudyResults) -> Table:
+    """A row per trace: how its processing times are distributed."""
     rows = []
     for trace in results.traces:
         times, name = trace["times"], printable(trace["trace"])
-        calls, drift = times["calls"], times["drift"]
-        entries = [Entry(name, name), Entry(f"{calls['n']:,}", calls["n"])]
-        for key in ("median_ms", "p95_ms", "p99_ms", "max_ms"):
-            entries.append(_number(calls.get(key), ".1f"))
-        share = times["slower_than_frames"]
-        entries += [Entry(f"{100 * share:.1f}%", share), _number(drift.get("ratio"), ".2f")]
-        rows.append((*entries, Entry(f"{len(times['stalls']):,}", len(times["stalls"]))))
+        calls, share, stalls = times["calls"], times["slower_than_frames"], len(times["stalls"])
+        rows.append((
+            Entry(name, name), Entry(f"{calls['n']:,}", calls["n"]),
+            *(_number(calls.get(f"{key}_ms"), ".1f") for key in ("median", "p95", "p99", "max")),
+            Entry(f"{100 * share:.1f}%", share), _number(times["drift"].get("ratio"), ".2f"),
+            Entry(f"{stalls:,}", stalls),
+        ))  # fmt: skip
+    header = ("trace", "calls", "median ms", "p95", "p99", "longest", "slower than frames", "drift")
     caption = (
         "Times of the calls but the initialisations; drift: the last third of the run to the "
         "first; stalls: calls of over ten times the median"
     )
-    yield _table(Table("times", caption, (*header, "drift", "stalls"), tuple(rows), 1))
-    for trace in results.traces:
-        stalls = trace["times"]["stalls"]
-        told = [
-            f"{stall['ms']:.1f} ms in {stall['sequence']}, frame {stall['frame']}"
-            + (" (first call after the initialisation)" if stall["first_call"] else "")
-            for stall in stalls[:STALLS]
-        ]
-        if told:
-            more = f"; and {len(stalls) - STALLS:,} more" if len(stalls) > STALLS else ""
-            yield f"<p><b>{escape(printable(trace['trace']))}</b>, stalls: " + (
-                f"{escape(printable('; '.join(told)))}{more}.</p>"
-            )
+    return Table("times", caption, (*header, "stalls"), tuple(rows), 1)
 
 
 def _number(value: float | None, form: str) -> Entry:
@@ -343,36 +328,23 @@ def _number(value: float | None, form: str) -> Entry:
 
 
 def _provenance(trace: dict[str, Any]) -> str:
-    told = trace["provenance"]
-    facts = {
-        "frames": f"{trace['world_frames']:,} in {trace['sequences']:,} sequences at "
-        f"{trace['fps']} fps; {trace['processed']:,} processed, {trace['with_truth']:,} with truth",
-        "images": ", ".join(f"{size} ({n})" for size, n in trace["image_sizes"].items()),
-    }
-    for key in ("tracker", "device", "timing", "schedule", "dataset"):
-        facts[key] = _words(told.get(key, "not said"))
-    facts = {name: printable(value) for name, value in facts.items()}
-    marks = "".join(f'<li class="warning">{escape(printable(w))}</li>' for w in trace["warnings"])
-    everything = json.dumps(told, indent=1, sort_keys=True, ensure_ascii=False)
-    marks = f"<ul>{marks}</ul>" if marks else ""
-    return (
-        f"<details><summary>{escape(printable(trace['trace']))}</summary>{_pairs(facts)}{marks}"
-        f"<details><summary>All it says of itself</summary><pre>{escape(everything)}</pre>"
-        "</details></details>"
+    """What a trace says of itself, and what to know of its times."""
+    stalls = trace["times"]["stalls"]
+    told = [
+        f"stall: {stall['ms']:.1f} ms in {stall['sequence']}, frame {stall['frame']}"
+        + (" (first call after the initialisation)" if stall["first_call"] else "")
+        for stall in stalls[:STALLS]
+    ]
+    told += [f"{len(stalls) - STALLS:,} more stalls"] if len(stalls) > STALLS else []
+    frames = (
+        f"{trace['world_frames']:,} frames in {trace['sequences']:,} sequences at {trace['fps']} "
+        f"fps; {trace['processed']:,} processed, {trace['with_truth']:,} with truth; images: "
+        + ", ".join(trace["image_sizes"])
     )
-
-
-def _words(value: Any) -> str:
-    """A value of a trace's metadata; what is nested in it is told below."""
-    if not isinstance(value, dict):
-        return str(value)
-    flat = [f"{key} {its}" for key, its in value.items() if not isinstance(its, (dict, list))]
-    return ", ".join(flat) or "not said"
-
-
-def _conventions(results: StudyResults) -> str:
-    used = dict.fromkeys(row["convention"] for row in results.summary)
-    return _pairs({name: told_convention(CONVENTIONS[name]) for name in used})
+    lists = [*_list(trace["warnings"], ' class="warning"'), *_list([frames, *told])]
+    name = escape(printable(trace["trace"]))
+    about = _json(trace["provenance"])
+    return f"<details><summary>{name}</summary>{''.join(lists)}{about}</details>"
 
 
 def told_convention(convention: Convention) -> str:
