@@ -18,6 +18,7 @@ import numpy as np
 from lae_sim.clock import parse_duration
 from lae_sim.metrics import CENTRE_THRESHOLDS
 from lae_sim.plots import new_figure
+from lae_sim.statistics import ALL_TRACES
 from lae_sim.study_summary import MEAN, Row, Scores
 from lae_sim.study_text import SETTINGS
 from lae_sim.study_view import View, row_of, run_of, setting_of, told_setting
@@ -334,12 +335,14 @@ def attributes(view: View) -> Iterator[Picture]:
     if view.attributes is None:
         return
     for dataset, group in view.attributes.groupby("dataset", sort=False):
-        value = "recovered" if group["recovered"].notna().any() else "mean"
+        pooled = group[group["trace"] == ALL_TRACES]
+        shown = group if pooled.empty else pooled
+        value = "recovered" if shown["recovered"].notna().any() else "mean"
         what = "share of the latency loss recovered" if value == "recovered" else "AUC"
         yield drawn(
             f"{dataset}: {what} on the sequences of each attribute (n of them), with 95 % "
             "intervals where they are known; at the first sigma",
-            lambda group=group, value=value: attribute_bars(group, "auc", value),  # type: ignore[misc]
+            lambda shown=shown, value=value: attribute_bars(shown, "auc", value),  # type: ignore[misc]
         )
 
 
