@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from lae_sim.strides import followed
 from lae_sim.trace import Trace, batched
 
 _GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
-_LANE_FRAMES = 1 << 22  # and of their repetitions
+_LANE_FRAMES = 1 << 21  # and of their repetitions
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,30 +105,38 @@ class _Job:
         recording, frames = self.recording, schedule.frames
         if self.passes:
             return _from_passes(recording, {self.stride: recording, **self.passes}, schedule)
-        boxes = _boxes(recording, frames)
-        return Run(recording, schedule, boxes, _departures(recording, frames, self.stride))
+        departures = _departures(self.before, frames)
+        return Run(recording, schedule, _boxes(recording, frames), departures)
+
+    @cached_property
+    def before(self) -> Ints:
+        return _before(self.recording, self.stride)
 
 
 def _boxes(recording: Recording, frames: Ints) -> Floats:
     """The boxes of some frames, float64 [n, 4]."""
-    boxes: Floats = recording.boxes[frames]
-    absent = np.flatnonzero(np.isnan(boxes[:, 0]))
-    if len(absent):
+    boxes: Floats = recording.boxes.take(frames, axis=0)
+    absent = np.isnan(boxes[:, 0])
+    if absent.any():
         raise LaeError(
-            f"sequence {recording.name!r}, frame {frames[absent[0]]}: the trace has no "
+            f"sequence {recording.name!r}, frame {frames[absent][0]}: the trace has no "
             "box for it, since the tracker skipped it; replay a trace of every frame instead"
         )
     return boxes
 
 
-def _departures(recording: Recording, frames: Ints, stride: Fraction) -> int:
-    """How many of some frames followed another one when they were recorded."""
+def _before(recording: Recording, stride: Fraction) -> Ints:
+    """The frame that each one followed when it was recorded, or would have, int64 [T]; 0: -1."""
     if stride > 1:
-        before = followed(stride, len(recording))[frames[1:]]
-    else:
-        recorded = np.flatnonzero(~np.isnan(recording.boxes[:, 0]))
-        before = recorded[np.searchsorted(recorded, frames[1:]) - 1]
-    return int(np.count_nonzero(before != frames[:-1]))
+        return followed(stride, len(recording))
+    processed = ~np.isnan(recording.boxes[:, 0])
+    latest_one = np.maximum.accumulate(np.where(processed, np.arange(len(processed)), -1))
+    return np.concatenate([[-1], latest_one[:-1]])
+
+
+def _departures(before: Ints, frames: Ints) -> int:
+    """How many of some frames followed another one when they were recorded."""
+    return int(np.count_nonzero(before.take(frames[1:]) != frames[:-1]))
 
 
 def _from_passes(
@@ -140,7 +149,7 @@ def _from_passes(
     nearest = min(range(len(strides)), key=lambda k: abs(strides[k] - step))
     source = passes[strides[nearest]]
     boxes = _boxes(source, frames)
-    departures = _departures(source, frames, strides[nearest])
+    departures = _departures(_before(source, strides[nearest]), frames)
     parted = np.zeros(len(frames), bool)
     for stride in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
         parted |= iou(_boxes(passes[stride], frames), boxes) < PARTED_IOU

@@ -83,13 +83,13 @@ def test_a_batch_fails_where_its_runs_do() -> None:
     for policy, timing in ((backwards_at_40, None), (latest, gappy())):
         outcomes = []
         for together in (False, True):
-            names = []
+            names: list[str] = []
             runs = replay_trace(TRACE, policy=policy, timing=timing, batch=together)
             with pytest.raises(LaeError) as error:
-                for found in runs:
-                    names.append(found.recording.name)
+                names.extend(found.recording.name for found in runs)
             outcomes.append((names, str(error.value)))
         assert outcomes[0] == outcomes[1]
+        assert outcomes[0][0]
 
 
 def gappy() -> Trace:
