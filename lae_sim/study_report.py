@@ -123,25 +123,27 @@ _PAIRS = (
 Section = tuple[str, str, Iterable[str]]
 
 
-def write_report(results: StudyResults, path: str | os.PathLike[str]) -> None:
+def write_report(results: StudyResults | View, path: str | os.PathLike[str]) -> None:
     """Write the report.
 
     Args:
-        results: of a study; the same ones give the same bytes.
+        results: of a study, or a view of them; the same ones give the same bytes.
         path: of the page.
 
     Raises:
         LaeError: if the file cannot be written.
     """
     with written_whole(path) as temporary:
-        temporary.write_text(page(results), "utf-8")
+        view = results if isinstance(results, View) else View(results)
+        temporary.write_text(page(view), "utf-8")
 
 
-def page(results: StudyResults) -> str:
+def page(view: View) -> str:
     """The report's HTML."""
+    results = view.results
     sections = [
         (anchor, title, text)
-        for anchor, title, parts in _sections(View(results))
+        for anchor, title, parts in _sections(view)
         if (text := "\n".join(parts))
     ]
     contents = "".join(f'<li><a href="#{a}">{escape(t)}</a></li>' for a, t, _ in sections)

@@ -255,13 +255,18 @@ def required_table(view: View) -> Table:
     )
 
 
-def write_tables(results: StudyResults, folder: str | os.PathLike[str]) -> None:
+def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -> None:
     """Write every table as CSV, with numbers in full, and as LaTeX for a paper's ``input``.
+
+    Args:
+        results: of a study, or a view of them, which the report may have in common.
+        folder: where to; made if it is not there.
 
     Raises:
         LaeError: if a file cannot be written.
     """
-    view = View(results)
+    view = results if isinstance(results, View) else View(results)
+    results = view.results
     Path(folder).mkdir(parents=True, exist_ok=True)
     tables: Sequence[Table | None] = (
         ranking(view),

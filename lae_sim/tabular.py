@@ -115,8 +115,8 @@ def _ranked(entry: Entry) -> str:
 
 _TEX = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}",
-    "Δ": r"$\Delta$", "★": r"$\star$", **{c: "\\" + c for c in "&%$#_{}"},
+    "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\char34{}",
+    "[": "{[}", "Δ": r"$\Delta$", "★": r"$\star$", **{c: "\\" + c for c in "&%$#_{}"},
 }  # fmt: skip
 
 

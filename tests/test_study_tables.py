@@ -157,4 +157,4 @@ def test_latex_escapes():
         r"a\_b \& 50\% \#1 \$x\$ \{\textasciitilde{}\textasciicircum{}\textbackslash{}\}"
     )
     assert tex("x\ny\x00") == "x y "
-    assert tex("DTB70-ECO 0.1 [-0.2, -3]") == "DTB70-ECO 0.1 [$-$0.2, $-$3]"
+    assert tex("DTB70-ECO 0.1 [-0.2, -3]") == "DTB70-ECO 0.1 {[}$-$0.2, $-$3]"
