@@ -49,6 +49,12 @@ class Picture:
     svg: bytes
 
 
+def _short(name: object) -> str:
+    """A name that fits into a picture."""
+    text = printable(name)
+    return text if len(text) <= 36 else f"{text[:17]}…{text[-17:]}"
+
+
 def _style(view: View, run: str, forecaster: str = "hold") -> dict[str, Any]:
     """Colour and mark of the tracker, line of the forecaster."""
     place, n = list(dict.fromkeys(view.names.values())).index(view.names[run]), len(_COLOURS)
@@ -101,13 +107,14 @@ def drawn(caption: str, draw: Callable[[], Figure]) -> Picture:
     return Picture(caption, file.getvalue())
 
 
-def _below(figure: Figure, columns: int = 4) -> None:
-    """One legend of all panels, below them."""
+def _below(figure: Figure) -> None:
+    """One legend of all panels, below them, in as many columns as fit."""
     found = {
         label: handle
         for axes in figure.axes
         for handle, label in zip(*axes.get_legend_handles_labels())
     }
+    columns = max(1, min(4, 150 // (max(map(len, found), default=0) + 8)))
     figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=columns)
 
 
@@ -142,9 +149,11 @@ def _curves(view: View, rows: Sequence[Row]) -> Figure:
     for row in rows:
         run, forecaster = run_of(row), row["forecaster"]
         style = {**_style(view, run, forecaster), "marker": ""}
-        lines = [(f"{view.names[run]}, {printable(forecaster)}", "", style)]
+        lines = [(f"{_short(view.names[run])}, {_short(forecaster)}", "", style)]
         if forecaster == "hold":
-            lines.insert(0, (f"{view.names[run]}, offline", "offline_", {**style, "ls": "--"}))
+            lines.insert(
+                0, (f"{_short(view.names[run])}, offline", "offline_", {**style, "ls": "--"})
+            )
         for name, which, style in lines:
             style.pop("linestyle" if which else "", None)
             means = [about["curves"] for about in row["scores"].about]
@@ -159,7 +168,7 @@ def _curves(view: View, rows: Sequence[Row]) -> Figure:
             right.plot(CENTRE_THRESHOLDS, precision, label=label, **style)
     left.set(xlabel="overlap threshold", ylabel="success", xlim=(0, 1), ylim=(0, 1))
     right.set(xlabel="centre error threshold (px)", ylabel="precision", xlim=(0, 50), ylim=(0, 1))
-    _below(figure, 2)
+    _below(figure)
     return figure
 
 
@@ -187,7 +196,7 @@ def sweep(view: View, key: str) -> Picture | None:
     for dataset in datasets:
         best, told = _best(view, [row for row in points if row["dataset"] == dataset])
         kept += best
-        caption += told and f"{told} on {printable(dataset)}"
+        caption += told and f"{told} on {_short(dataset)}"
     return drawn(caption, lambda: _sweep(view, kept, datasets, key))
 
 
@@ -213,9 +222,9 @@ def _sweep(view: View, rows: Sequence[Row], datasets: Sequence[str], key: str) -
                 its = sorted(its, key=lambda row: row["x"])
                 style = _style(view, run, forecaster) | ({"marker": ""} if len(its) > 12 else {})
                 ys = [np.nan if row[metric] is None else row[metric] for row in its]
-                name = f"{view.names[run]}, {printable(forecaster)}"
+                name = f"{_short(view.names[run])}, {_short(forecaster)}"
                 axes.plot([row["x"] for row in its], ys, label=name, **style)
-            axes.set(ylabel=label, title=printable(dataset))
+            axes.set(ylabel=label, title=_short(dataset))
             if axes.get_subplotspec().is_last_row():
                 axes.set_xlabel(SWEEPS[key])
             xs = sorted({row["x"] for row in rows})
@@ -249,7 +258,7 @@ def _front(view: View, rows: Sequence[Row]) -> Figure:
             )
             xs, ys = [row["elapsed_ms"] for row in its], [row["auc"] for row in its]
             style = {"color": "0.45", "linestyle": _line(view, forecaster), "zorder": 1}
-            axes.plot(xs, ys, label=f"front, {printable(forecaster)}", **style)
+            axes.plot(xs, ys, label=f"front, {_short(forecaster)}", **style)
         for row in ours:
             filled = "full" if row["forecaster"] != "hold" else "none"
             style = {**_style(view, run_of(row)), "linestyle": "", "fillstyle": filled}
@@ -271,8 +280,8 @@ def _front(view: View, rows: Sequence[Row]) -> Figure:
             if x > (left + right) / 2:
                 aside = {"xytext": (-8, 0), "ha": "right"}
             label = {"textcoords": "offset points", "va": "center", "fontsize": 8, **aside}
-            axes.annotate(view.names[run], (x, y), **label)
-        axes.set(xlabel="mean time of a call (ms)", ylabel="AUC", title=printable(dataset))
+            axes.annotate(_short(view.names[run]), (x, y), **label)
+        axes.set(xlabel="mean time of a call (ms)", ylabel="AUC", title=_short(dataset))
         axes.set_ylim(low, max(high, *(y + 0.05 * (high - low) for _, y in taken)))
     for axes in panels[len(datasets) :]:
         axes.remove()
@@ -299,7 +308,7 @@ def _gains(view: View, rows: Sequence[Row], runs: Sequence[str]) -> Figure:
     figure = new_figure(10, 1.3 + 0.3 * len(runs) + 0.1 * len(rows))
     panels = figure.subplots(1, 2, sharey=True)
     rivals = [name for name in view.forecasters if name != "hold"]
-    datasets = {run_of(row): printable(row["dataset"]) for row in rows}
+    datasets = {run_of(row): _short(row["dataset"]) for row in rows}
     several = len(set(datasets.values())) > 1
     for axes, key, factor in zip(panels, ("vs_hold_auc", "recovered_auc"), (1, 100)):
         axes.axvline(0, color="0.4", linewidth=0.8)
@@ -314,7 +323,7 @@ def _gains(view: View, rows: Sequence[Row], runs: Sequence[str]) -> Figure:
                     factor * row[f"{key}_{end}"] for end in ("low", "high") if f"{key}_{end}" in row
                 ]
                 axes.plot(ends, [y] * len(ends), color=colour, linewidth=1.5)
-                label = printable(forecaster)
+                label = _short(forecaster)
                 axes.plot(factor * value, y, _MARKS[f % 8], color=colour, label=label, markersize=5)
     panels[0].set(xlabel="AUC won over hold", ylim=(len(runs) - 0.5, -0.5))
     panels[1].set(xlabel="latency loss recovered (%)")
@@ -322,7 +331,7 @@ def _gains(view: View, rows: Sequence[Row], runs: Sequence[str]) -> Figure:
     panels[1].set_xlim(max(low, -100), min(high, 150))  # where little was lost, intervals are wide
     panels[0].set_yticks(
         range(len(runs)),
-        [view.names[r] + (f" ({datasets[r]})" if several else "") for r in runs],
+        [_short(view.names[r]) + (f" ({datasets[r]})" if several else "") for r in runs],
     )
     _below(figure)
     return figure
@@ -364,7 +373,7 @@ def _histograms(traces: Sequence[Row]) -> Figure:
     for axes, trace in zip(panels, traces):
         found, interval = trace["times"]["histogram"], trace["times"]["frame_interval_ms"]
         axes.stairs(found["counts"], found["edges_ms"], fill=True, color=_COLOURS[0])
-        axes.set_title(printable(trace["trace"]), fontsize=8)
+        axes.set_title(_short(trace["trace"]), fontsize=8)
         outside = found["below"] + found["above"]
         axes.set_xlabel(f"ms ({outside:,} of {trace['times']['calls']['n']:,} calls outside)")
         if found["edges_ms"][0] < interval < found["edges_ms"][-1]:

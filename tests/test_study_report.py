@@ -84,7 +84,7 @@ def test_the_page_is_whole_and_has_every_section(checked):
     assert len(ids) == len(set(ids))
     assert {*ids} == {
         "failures", "ranking", "table2", "curves", "sweeps", "front", "gains", "attributes",
-        "comparisons", "required", "times", "traces", "conventions", "notes", "study",
+        "comparisons", "required", "times", "traces", "conventions", "study",
     }  # fmt: skip
     assert [a["href"] for a in checked.of("a")] == [f"#{name}" for name in ids]
     assert all(th.get("scope") for th in checked.of("th"))
