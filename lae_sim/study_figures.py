@@ -236,9 +236,11 @@ def _sweep(view: View, rows: Sequence[Row], datasets: Sequence[str], key: str) -
     return figure
 
 
-def front(view: View) -> Picture:
+def front(view: View) -> Picture | None:
     """AUC against the time of a call, and the Pareto front of each dataset and forecaster."""
     rows = [row for row in view.standing if row["auc"] is not None]
+    if not rows:
+        return None
     caption = "AUC against the mean time of a call; hollow: hold; lines join what no other tracker"
     return drawn(f"{caption} beats in both: {told_setting(rows)}", lambda: _front(view, rows))
 

@@ -73,7 +73,8 @@ pre { overflow-x: auto; font-size: .8rem; line-height: 1.4 }
 .warning { background: var(--mark); padding: .1rem .4rem; border-radius: 4px }
 @media print { body { max-width: none; font-size: 11px } .scroll { max-height: none;
   overflow: visible; border: 0 } nav { display: none } thead th { position: static }
-  figure, tr { break-inside: avoid } table { font-size: 7px } th, td { padding: 1px 3px } }
+  figure, tr { break-inside: avoid } h2 { break-after: avoid }
+  table { font-size: 7px } th, td { padding: 1px 3px } }
 """
 
 _SCRIPT = """
@@ -225,12 +226,15 @@ def _sections(view: View) -> Iterator[Section]:
         yield "required", "What the required AUC asks for", shown
     pictures = _figures([study_figures.histograms(view)])
     yield "times", "Processing times", [*pictures, _table(_times(results))]
-    yield "traces", "Traces", map(_provenance, results.traces)
+    digests = {source.input.label: source.input.digest for source in results.plan.sources}
+    told = [_provenance(trace, digests.get(trace["trace"], "unknown")) for trace in results.traces]
+    yield "traces", "Traces", told
     used = dict.fromkeys(row["convention"] for row in results.summary)
-    told = {name: told_convention(CONVENTIONS[name]) for name in used}
-    yield "conventions", "Conventions", [_pairs(told)]
+    meant = {name: told_convention(CONVENTIONS[name]) for name in used}
+    yield "conventions", "Conventions", [_pairs(meant)]
     yield "notes", "Notes", _list(results.notes())
-    yield "study", "The study", [_json(results.plan.study.document())]
+    asked = _json(results.plan.study.document())
+    yield "study", "The study", [f"<details><summary>What was asked for</summary>{asked}</details>"]
 
 
 def _list(texts: Sequence[str], kind: str = "") -> list[str]:
@@ -329,7 +333,7 @@ def _number(value: float | None, form: str) -> Entry:
     return Entry("-" if value is None else f"{value:{form}}", value)
 
 
-def _provenance(trace: dict[str, Any]) -> str:
+def _provenance(trace: dict[str, Any], digest: str) -> str:
     """What a trace says of itself, and what to know of its times."""
     stalls = trace["times"]["stalls"]
     told = [
@@ -343,7 +347,10 @@ def _provenance(trace: dict[str, Any]) -> str:
         f"fps; {trace['processed']:,} processed, {trace['with_truth']:,} with truth; images: "
         + ", ".join(trace["image_sizes"])
     )
-    lists = [*_list(trace["warnings"], ' class="warning"'), *_list([frames, *told])]
+    lists = [
+        *_list(trace["warnings"], ' class="warning"'),
+        *_list([frames, f"SHA-256 of the file: {digest}", *told]),
+    ]
     name = escape(printable(trace["trace"]))
     about = _json(trace["provenance"])
     return f"<details><summary>{name}</summary>{''.join(lists)}{about}</details>"
