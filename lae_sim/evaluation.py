@@ -1,36 +1,25 @@
-"""Latency-aware and offline scores of runs, per sequence, for any number of permitted latencies.
-
-Each distinct pair of a world frame and an output is scored once, and its counts are added over the
-range of sigmas that it answers by difference arrays; counts are integers, so that no order of
-summation changes a result.
-"""
+"""Latency-aware and offline scores of runs, per sequence, for any number of permitted latencies."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from lae_sim.boxes import Bools, Floats
+from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError, explained
-from lae_sim.forecast import AnyFactory, Lanes, SequenceFactory, forecast, own
+from lae_sim.forecast import AnyFactory, Lanes, factory_for, forecast, own
 from lae_sim.metadata import Metadata
-from lae_sim.metrics import (
-    CENTRE_THRESHOLDS,
-    METRICS,
-    NORM_THRESHOLDS,
-    PYSOT,
-    Convention,
-    frame_counts,
-)
+from lae_sim.metrics import METRICS, PYSOT, Convention
 from lae_sim.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.run import Run
+from lae_sim.scoring import Scorer
 from lae_sim.trace import BATCH_ROWS, batched
+
+_PART = 1 << 19  # outputs that forecasters are fed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +157,11 @@ def _evaluate_group(
     needed = {0, *(costs.get(name, 0) for name in forecasters)}
     pairings = {cost: pair(schedules, sigmas, at_arrival, cost) for cost in needed}
     pairing = pairings[0]
-    scorer = _Scorer(runs, convention)
+    scorer = Scorer(runs, convention)
     scored = [
-        scorer.of(*_answers(runs, metadata, pairings[costs.get(name, 0)], name, factory), sigmas)
+        scorer.of(
+            _answers(runs, metadata, pairings[costs.get(name, 0)], name, factory), len(sigmas)
+        )
         for name, factory in forecasters.items()
     ]
     offline = scorer.offline()
@@ -230,7 +221,7 @@ def answers(
 ) -> Answers:
     """What a forecaster answers for every world frame of one run."""
     pairing = pair([run.schedule], [sigma], at_arrival, cost_ns)
-    fed, found, boxes = _answers([run], metadata, pairing, name, factory)
+    ((fed, found, boxes),) = _answers([run], metadata, pairing, name, factory)
     return Answers(pairing.frames[fed.output[found.item]], boxes)
 
 
@@ -254,125 +245,30 @@ def _answers(
     pairing: Pairing,
     name: str,
     factory: AnyFactory,
-) -> tuple[Histories, Pairs, Floats]:
-    """The distinct pairs of a forecaster with their boxes, float64 [P, 4]."""
+) -> Iterator[tuple[Histories, Pairs, Floats]]:
+    """The distinct pairs of a forecaster with their boxes, float64 [P, 4], in parts.
+
+    Parts are of whole sequences. Where sigmas share no history there may be 51 times the outputs,
+    so that a group of few frames is large.
+    """
     if getattr(factory, "sees_frames", False) and pairing.sigmas[0] < 0:
         raise LaeError(
             f"{name} sees frames when they arrive: not before, as sigma < 0 would have it"
         )
-    fed = histories(pairing, memoryless=own(factory, "memoryless"))
-    found = pairs(pairing, fed)
     sizes = [metadata.image_size(run.recording.name) or (np.inf, np.inf) for run in runs]
-    lanes = lanes_of(runs, pairing, fed, np.array(sizes, np.float64))
-    if not isinstance(factory, SequenceFactory):
-        return fed, found, forecast(factory, lanes, found.item, found.frame, name)
+    image_sizes = np.array(sizes, np.float64)
     with explained(name):
-        factories = [factory.for_sequence(run.recording) for run in runs]
-    answered = np.empty((len(found.item), 4))
-    for each in {id(its): its for its in factories}.values():  # at once where several share one
-        theirs = np.array([its is each for its in factories])[fed.sequence]
-        part, asked, item = lanes.chosen(theirs, found.item)
-        answered[asked] = forecast(each, part, item, found.frame[asked], name)
-    return fed, found, answered
-
-
-@dataclass(frozen=True, eq=False)
-class _Scored:
-    """The scores of one forecaster; see :class:`Evaluation`, without the first axis."""
-
-    scores: Mapping[str, Floats]
-    failure: Ints
-    success: Floats
-    precision: Floats
-
-
-class _Scorer:
-    """Scores answers of some runs against their truth."""
-
-    def __init__(self, runs: Sequence[Run], convention: Convention) -> None:
-        self._convention = convention
-        self._lengths = np.array([len(run.recording) for run in runs], np.int64)
-        self._bases = np.cumsum(self._lengths) - self._lengths
-        self._truth = np.concatenate([run.recording.truth for run in runs])
-        self._boxes = np.concatenate([run.recording.boxes for run in runs])
-        counted = self._lengths
-        if convention.leaves_out:
-            valid = convention.valid_success(self._truth)
-            counted = np.add.reduceat(valid.astype(np.int64), self._bases)
-        self._counted = np.where(counted > 0, counted, np.nan)
-
-    def of(
-        self, fed: Histories, found: Pairs, boxes: Floats, sigmas: Sequence[Fraction]
-    ) -> _Scored:
-        """Score paired answers."""
-        history = np.searchsorted(fed.offsets, found.item, "right") - 1
-        return self._scored(fed.sequence[history], found, boxes, len(sigmas))
-
-    def offline(self) -> _Scored:
-        """Score every frame's own box; NaN for sequences that lack some."""
-        sequence = np.repeat(np.arange(len(self._bases)), self._lengths)
-        frame = np.arange(len(self._truth)) - self._bases[sequence]
-        none = np.zeros_like(frame)
-        scored = self._scored(sequence, Pairs(frame, frame, none, none + 1), self._boxes, 1)
-        missing = np.add.reduceat(np.isnan(self._boxes[:, 0]).astype(np.int64), self._bases) > 0
-        for values in (*scored.scores.values(), scored.success, scored.precision):
-            values[missing] = np.nan
-        return scored
-
-    def _scored(self, sequence: Ints, found: Pairs, boxes: Floats, count: int) -> _Scored:
-        truth = self._truth[self._bases[sequence] + found.frame]
-        counts = frame_counts(truth, boxes, found.frame, self._convention)
-        width = count + 1
-        begin, end = sequence * width + found.sigma_from, sequence * width + found.sigma_to
-
-        def summed(values: npt.NDArray[Any]) -> Ints:
-            size = len(self._bases) * width
-            steps = np.bincount(begin, values, size) - np.bincount(end, values, size)
-            return steps.reshape(-1, width).cumsum(axis=1)[:, :count].astype(np.int64)
-
-        sums = {
-            "auc": summed(counts.success),
-            "dp20": summed(counts.dp),
-            "norm_dp20": summed(counts.norm_dp),
-            "norm_auc": summed(counts.norm),
-        }
-        thresholds = {"auc": self._convention.thresholds, "norm_auc": len(NORM_THRESHOLDS)}
-        counted = self._counted[:, None]
-        scores = {m: sums[m] / (counted * thresholds.get(m, 1)) for m in METRICS}
-        at_first = found.sigma_from == 0
-        success, precision = (
-            _shares_above(sequence[at_first], passed[at_first], most, len(self._bases)) / counted
-            for passed, most in (
-                (counts.success, self._convention.thresholds),
-                (counts.precision, len(CENTRE_THRESHOLDS)),
-            )
-        )
-        if self._convention.drops_zeros:
-            bests = (sums["auc"], summed(counts.within50), sums["norm_auc"], sums["norm_auc"])
-            for metric, best in zip(METRICS, bests):
-                scores[metric] = np.where(best > 0, scores[metric], np.nan)
-            success[np.isnan(scores["auc"][:, 0])] = np.nan
-            precision[np.isnan(scores["dp20"][:, 0])] = np.nan
-        failure = self._failure(sequence, found, counts.apart, count)
-        return _Scored(scores, failure, success, precision[:, ::-1])
-
-    def _failure(self, sequence: Ints, found: Pairs, apart: Bools, count: int) -> Ints:
-        """The first frame of each sequence whose answer is apart from the truth, int64 [S, M]."""
-        failure = np.repeat(self._lengths[:, None], count, axis=1)
-        lost = np.flatnonzero(apart)
-        sequence, frame = sequence[lost], found.frame[lost]
-        begin, end = found.sigma_from[lost], found.sigma_to[lost]
-        for m in range(count):
-            of_m = np.flatnonzero((begin <= m) & (m < end))  # their frames ascend in each sequence
-            those = sequence[of_m]
-            first = np.flatnonzero(np.diff(those, prepend=-1))
-            failure[those[first], m] = frame[of_m[first]]
-        return failure
-
-
-def _shares_above(sequence: Ints, passed: Ints, most: int, sequences: int) -> Floats:
-    """How many frames passed more than 0, 1, ..., ``most`` - 1 thresholds, float64 [S, most]."""
-    width = most + 1
-    counts = np.bincount(sequence * width + passed, minlength=sequences * width)
-    above = counts.reshape(-1, width)[:, :0:-1].cumsum(axis=1)[:, ::-1]
-    return above.astype(np.float64)
+        factories = [factory_for(factory, run.recording) for run in runs]
+    for fed in histories(pairing, memoryless=own(factory, "memoryless")).parts(_PART):
+        found = pairs(pairing, fed)
+        lanes = lanes_of(runs, pairing, fed, image_sizes)
+        shared = {id(its): its for its in factories}.values()
+        if len(shared) == 1:
+            yield fed, found, forecast(factories[0], lanes, found.item, found.frame, name)
+            continue
+        answered = np.empty((len(found.item), 4))
+        for each in shared:  # at once where several share one
+            theirs = np.array([its is each for its in factories])[fed.sequence]
+            part, asked, item = lanes.chosen(theirs, found.item)
+            answered[asked] = forecast(each, part, item, found.frame[asked], name)
+        yield fed, found, answered

@@ -69,9 +69,9 @@ class TunedKalman:
         self, lanes: Lanes, item: Ints, frame: Ints, restart_iou: float | None = None
     ) -> Floats:
         """The same for many lanes at once; restarts as in :func:`filter_lanes`."""
-        position, velocity = filter_lanes(lanes, self, restart_iou)
+        position, velocity = filter_lanes(lanes, item, self, restart_iou)
         reach = self.reach((frame - lanes.frames[item]).astype(np.float64))
-        return self.boxes(position[item] + reach[:, None] * velocity[item])
+        return self.boxes((position + reach * velocity).T)
 
     def reach(self, interval: Number) -> Number:
         """How many frames' velocity an interval of so many frames is worth."""
@@ -236,7 +236,10 @@ def clip(forecasts: Floats, raw: Floats, image_sizes: Floats) -> Floats:
 
 
 def filter_lanes(
-    lanes: Lanes, settings: TunedKalman = PAPER, restart_iou: float | None = None
+    lanes: Lanes,
+    item: Ints,
+    settings: TunedKalman = PAPER,
+    restart_iou: float | None = None,
 ) -> tuple[Floats, Floats]:
     """Filter all lanes in step: the k-th update of every lane that has one, for each k.
 
@@ -245,11 +248,12 @@ def filter_lanes(
 
     Args:
         lanes: what the filters are fed.
+        item: the items asked about, int64 [P].
         settings: the filter.
         restart_iou: a measurement that overlaps its prediction by less restarts the filter there.
 
     Returns:
-        Position and velocity of the state after each item, float64 [N, 4] each.
+        Position and velocity of the state after each of these items, float64 [4, P] each.
     """
     lengths = np.diff(lanes.offsets)
     longest = np.argsort(-lengths, kind="stable")
@@ -282,6 +286,7 @@ def filter_lanes(
             position[:, lost], velocity[:, lost] = measured[:, now][:, lost], 0.0
             for each, value in zip(covariance, start):
                 each[lost] = value
-    found = np.empty((2, len(order), 4))
-    found[0, order], found[1, order] = positions.T, velocities.T
-    return found[0], found[1]
+    where = np.empty_like(order)
+    where[order] = np.arange(len(order))
+    asked = where[item]
+    return positions[:, asked], velocities[:, asked]

@@ -8,7 +8,7 @@ where K = ceil(b*t / frame_ticks) is its *step*: all is integer from there on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import lcm
@@ -183,6 +183,29 @@ class Histories:
     sigma_to: Ints
     offsets: Ints
     output: Ints
+
+    def parts(self, items: int) -> Iterator[Histories]:
+        """The same in parts of whole sequences, of at most so many items if one has no more."""
+        begins = np.flatnonzero(np.diff(self.sequence, prepend=-1))
+        sizes = np.diff(self.offsets[np.append(begins, len(self.sequence))])
+        first = total = 0
+        for begin, size in zip(begins.tolist(), sizes.tolist()):
+            if total and total + size > items:
+                yield self._part(first, begin)
+                first, total = begin, 0
+            total += size
+        yield self._part(first, len(self.sequence))
+
+    def _part(self, first: int, end: int) -> Histories:
+        those = slice(first, end)
+        offsets = self.offsets[first : end + 1]
+        return Histories(
+            self.sequence[those],
+            self.sigma_from[those],
+            self.sigma_to[those],
+            offsets - offsets[0],
+            self.output[offsets[0] : offsets[-1]],
+        )
 
 
 def histories(pairing: Pairing, memoryless: bool = False) -> Histories:

@@ -33,6 +33,7 @@ LAYERS = [
     {"batch", "rows", "checks"},
     {"trace"},
     {"run"},
+    {"scoring"},
     {"evaluation"},
     # command lines, importers, reports and plots come after
 ]
