@@ -53,9 +53,11 @@ caption { text-align: left; padding: .5rem .7rem; color: var(--soft) }
 caption span { position: sticky; left: .7rem; display: inline-block; max-width: min(46rem, 90vw) }
 th, td { padding: .28rem .7rem; text-align: right; white-space: nowrap;
   border-bottom: 1px solid var(--line) }
-thead th { position: sticky; top: 0; z-index: 1; background: var(--head) }
+thead th, thead td { position: sticky; top: 0; z-index: 2; background: var(--head) }
 thead tr:nth-child(2) th { top: 1.9rem }
-thead tr.groups th { text-align: center; height: 1.9rem }
+thead tr.groups > * { text-align: center; height: 1.9rem }
+tr > th.name:first-child { position: sticky; left: 0 } thead th.name:first-child { z-index: 3 }
+tbody th.name:first-child { background: var(--page); z-index: 1 }
 th.name { text-align: left; font-weight: 400 } thead th { font-weight: 600 }
 th button { all: unset; cursor: pointer } th button:focus-visible { outline: 2px solid var(--link) }
 th button::after { content: " \\2195"; color: var(--soft) }
@@ -72,7 +74,8 @@ summary { cursor: pointer; font-weight: 600 }
 pre { overflow-x: auto; font-size: .8rem; line-height: 1.4 }
 .warning { background: var(--mark); padding: .1rem .4rem; border-radius: 4px }
 @media print { body { max-width: none; font-size: 11px } .scroll { max-height: none;
-  overflow: visible; border: 0 } nav { display: none } thead th { position: static }
+  overflow: visible; border: 0 } nav { display: none }
+  thead th, thead td, tr > th.name:first-child { position: static }
   figure, tr { break-inside: avoid } h2 { break-after: avoid }
   table { font-size: 7px } th, td { padding: 1px 3px } }
 """

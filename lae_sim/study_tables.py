@@ -118,7 +118,7 @@ def ranking(view: View) -> Table:
 
     order = {its: i for i, its in enumerate(dict.fromkeys(map(key, view.rows)))}
     rows = sorted(view.rows, key=lambda row: (order[key(row)], -(row["auc"] or 0)))
-    header = ["dataset", *differ, "tracker", "forecaster"]
+    header = ["tracker", "forecaster", "dataset", *differ]
     repeated = any("auc_jitter_low" in row for row in rows)
     titles = [title for title in _RANKING if repeated or title != "jitter"]
     cells = [*map(_name, header), *(_RANKING[title][0] for title in titles)]

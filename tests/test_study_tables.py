@@ -60,7 +60,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> StudyResults:
 
 def test_ranking_says_what_the_summary_says(results):
     table = ranking(View(results))
-    assert table.header[:4] == ("dataset", "scale", "tracker", "forecaster")
+    assert table.header[:4] == ("tracker", "forecaster", "dataset", "scale")
     found = {}
     for row in table.rows:
         entries = dict(zip(table.header, row))
