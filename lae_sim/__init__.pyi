@@ -1,3 +1,4 @@
+from .batch import simulate_lanes
 from .boxes import iou
 from .clock import Clock, parse_duration, parse_fps, parse_rational
 from .comparison import World, compare
@@ -13,6 +14,9 @@ from .frames import Dataset, ImageSequence
 from .kalman import Kalman, KalmanLaePvt
 from .latency import (
     LatencySource,
+    RandomSource,
+    Times,
+    bootstrap,
     by_call,
     by_frame,
     constant,
@@ -24,11 +28,13 @@ from .live import LiveRun, run_every_frame, run_real_time
 from .metadata import Metadata
 from .metrics import CONVENTIONS, Convention, precision_curve, success_curve
 from .pairing import SIGMA_GRID, Pairing, pair
-from .policies import every, fifo, latest, shrinking_tail, vot_realtime
+from .policies import LanePolicy, every, fifo, latest, shrinking_tail, vot_realtime
 from .recording import Recording
 from .render import Scene
-from .run import Run, replay_sequence, replay_trace
+from .run import Run, replay_repeated, replay_sequence, replay_trace
 from .statistics import by_attribute, comparison_table, summarise
+from .study_file import Study, read_study
+from .study_run import StudyResults, run_study
 from .synthetic import synthetic_dataset
 from .trace import Trace, read_trace, validate, write_trace
 from .worker import InProcess, Worker
@@ -55,21 +61,27 @@ __all__ = [
     "Kalman",
     "KalmanLaePvt",
     "LaeError",
+    "LanePolicy",
     "LatencySource",
     "LiveRun",
     "Metadata",
     "Pairing",
     "Policy",
+    "RandomSource",
     "Recording",
     "Run",
     "Scene",
     "Schedule",
     "Service",
+    "Study",
+    "StudyResults",
+    "Times",
     "Trace",
     "TraceError",
     "Worker",
     "World",
     "answers",
+    "bootstrap",
     "by_attribute",
     "by_call",
     "by_frame",
@@ -93,15 +105,19 @@ __all__ = [
     "parse_fps",
     "parse_rational",
     "precision_curve",
+    "read_study",
     "read_trace",
+    "replay_repeated",
     "replay_sequence",
     "replay_trace",
     "resampled",
     "run_every_frame",
     "run_real_time",
+    "run_study",
     "scaled",
     "shrinking_tail",
     "simulate",
+    "simulate_lanes",
     "success_curve",
     "summarise",
     "synthetic_dataset",

@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         PROGRAM, "Compare forecasters on traces: intervals, paired tests, loss recovered.", EXAMPLES
     )
     add = made.add_argument
-    add("traces", nargs="+", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")
+    add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add(
         "--forecaster",
         nargs="+",
@@ -87,10 +87,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
+    from lae_sim.locate import find_traces
     from lae_sim.trace import read_trace
 
+    arguments.traces = paths = find_traces(arguments.traces)
     _check(arguments)
-    paths = list(dict.fromkeys(arguments.traces))
     traces = {
         label: read_trace(path, arguments.sequence) for path, label in zip(paths, labels(paths))
     }

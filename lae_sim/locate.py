@@ -81,6 +81,8 @@ def _local(pattern: str, base: Path | None) -> list[str]:
         path = os.path.join(glob.escape(path), "*.parquet")
     elif os.path.exists(path):
         return [path]
+    elif not set("*?[") & set(path):
+        raise FileNotFoundError
     return [name for name in glob.glob(path, recursive=True) if os.path.isfile(name)]
 
 

@@ -50,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
         EXAMPLES,
     )
     add = made.add_argument
-    add("traces", nargs="+", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")
+    add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add_world(made, sweeps=True)
     scores = made.add_argument_group("forecasting and scores")
     add = scores.add_argument
@@ -111,12 +111,14 @@ def _replay(arguments: argparse.Namespace) -> None:
     import json
 
     from lae_sim import __version__
+    from lae_sim.locate import find_traces
     from lae_sim.pairing import SIGMA_GRID
 
     if arguments.eta is not None:
         arguments.sigma = [-eta for eta in arguments.eta]
-    for name in ("sigma", "forecaster", "traces", "fps", "latency_scale"):
+    for name in ("sigma", "forecaster", "fps", "latency_scale"):
         setattr(arguments, name, list(dict.fromkeys(getattr(arguments, name))))
+    arguments.traces = find_traces(arguments.traces)
     swept = [name for name in ("fps", "latency_scale") if len(getattr(arguments, name)) > 1]
     _check_files(arguments, swept)
     shown = sorted({float(sigma) for sigma in arguments.sigma})

@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("traces", nargs="+", metavar="TRACE", help="a trace (Parquet; see traces/FORMAT.md)")
+    add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add("--json", action="store_true", help="print one JSON object instead of text")
     add("--plot", metavar="FILE", help="draw the times (.png, .svg, .pdf)")
     arguments = parser.parse_args(argv)
@@ -46,9 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _show(arguments: argparse.Namespace) -> None:
     from lae_sim import __version__
     from lae_sim.files import check_distinct
+    from lae_sim.locate import find_traces
     from lae_sim.show_text import overview
     from lae_sim.trace import read_trace
 
+    arguments.traces = find_traces(arguments.traces)
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="replace")  # a name may have what the terminal has not
     if arguments.plot:

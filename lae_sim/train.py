@@ -66,9 +66,11 @@ def _train(arguments: argparse.Namespace) -> None:
     from lae_sim.comparison import parse_world
     from lae_sim.examples import Examples
     from lae_sim.learned import Learned, write_learned
+    from lae_sim.locate import find_traces
     from lae_sim.trace import read_trace
     from lae_sim.training import NetworkTrainer
 
+    arguments.traces = find_traces(arguments.traces)
     check_distinct([arguments.out], arguments.traces)
     check_folders([arguments.out])
     world = parse_world(arguments)
