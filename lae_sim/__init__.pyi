@@ -34,7 +34,9 @@ from .render import Scene
 from .run import Run, replay_repeated, replay_sequence, replay_trace
 from .statistics import by_attribute, comparison_table, summarise
 from .study_file import Study, read_study
+from .study_report import write_report
 from .study_run import StudyResults, run_study
+from .study_tables import write_tables
 from .synthetic import synthetic_dataset
 from .trace import Trace, read_trace, validate, write_trace
 from .worker import InProcess, Worker
@@ -123,5 +125,7 @@ __all__ = [
     "synthetic_dataset",
     "validate",
     "vot_realtime",
+    "write_report",
+    "write_tables",
     "write_trace",
 ]

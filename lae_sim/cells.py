@@ -240,6 +240,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
         only = {cell.forecaster: chosen[cell.forecaster]}
         details = {
             "engine": replay.engine,
+            "repetitions": setting.count,
             "curves": curves.means(f),
             "approximate_outputs": int(about.departures.sum()),
             "calls": int((about.processed - 1).sum()),

@@ -13,6 +13,7 @@ from lae_sim.errors import LaeError
 from lae_sim.options import whole
 
 if TYPE_CHECKING:
+    from lae_sim.study_file import Study
     from lae_sim.study_run import StudyResults
 
 PROGRAM = "lae-sim study"
@@ -76,21 +77,32 @@ def _study(arguments: argparse.Namespace) -> bool:
     if arguments.workers and arguments.scheduler:
         raise LaeError("--scheduler says where to compute: --workers is for this machine")
     results = _run(arguments, study, folder, path.parent)
+    if not arguments.no_report:
+        from lae_sim.study_report import write_report
+        from lae_sim.study_tables import write_tables
+        from lae_sim.study_view import View
+
+        view = View(results)
+        write_tables(view, results.folder / "tables")
+        write_report(view, results.folder / "report.html")
+    else:
+        (results.folder / "report.html").unlink(missing_ok=True)  # it would be of other results
     if arguments.json:
         print(json.dumps(results.document(), indent=2, allow_nan=False))
     else:
-        _tell(results)
+        from lae_sim.study_text import study_text
+
+        print(study_text(results), end="\n\n")
+        print(f"{results.folder}: " + ", ".join(sorted(p.name for p in results.folder.iterdir())))
     return bool(results.failures)
 
 
-def _run(arguments: argparse.Namespace, study: object, folder: str, base: Path) -> StudyResults:
+def _run(arguments: argparse.Namespace, study: Study, folder: str, base: Path) -> StudyResults:
     """Run with a progress bar, if the standard error stream is a terminal."""
     from tqdm import tqdm
 
-    from lae_sim.study_file import Study
     from lae_sim.study_run import run_study
 
-    assert isinstance(study, Study)
     with tqdm(unit=" tasks", disable=None) as bar:
 
         def progress(what: str, done: int, total: int) -> None:
@@ -98,13 +110,6 @@ def _run(arguments: argparse.Namespace, study: object, folder: str, base: Path) 
             bar.set_description(what)
 
         return run_study(study, folder, base, arguments.workers, arguments.scheduler, progress)
-
-
-def _tell(results: StudyResults) -> None:
-    """Print the summary."""
-    from lae_sim.study_text import study_text
-
-    print(study_text(results))
 
 
 if __name__ == "__main__":

@@ -156,11 +156,12 @@ def _curves(view: View, rows: Sequence[Row]) -> Figure:
             )
         for name, which, style in lines:
             style.pop("linestyle" if which else "", None)
-            means = [about["curves"] for about in row["scores"].about]
-            if means[0][f"{which}success"] is None:
+            cells = row["scores"].about
+            if cells[0]["curves"][f"{which}success"] is None:
                 continue
+            weights = [cell["repetitions"] for cell in cells]
             success, precision = (
-                np.mean([mean[which + kind] for mean in means], axis=0)
+                np.average([cell["curves"][which + kind] for cell in cells], 0, weights)
                 for kind in ("success", "precision")
             )
             label = f"{name} [{success.mean():.3f}, {precision[20]:.3f}]"
