@@ -139,8 +139,9 @@ def ranking(view: View) -> Table:
 def table2(view: View) -> Table:
     """Trackers with and without forecasters in rows, datasets in columns.
 
-    After Li et al., "Predictive Visual Tracking", 2021, Table II: AUC and DP of each dataset, and
-    how they change: without a forecaster relative to offline, with one relative to without.
+    In the manner of Table II of Li et al., "Predictive Visual Tracking", 2021: AUC and DP of each
+    dataset, and how they change: without a forecaster relative to offline, with one relative to
+    without. (Rows and columns are ours; the print may order them otherwise.)
     """
     rows = view.standing
     found = {(view.names[run_of(row)], row["dataset"], row["forecaster"]): row for row in rows}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lae_sim.report import table
 from lae_sim.statistics import p_label
@@ -34,11 +34,19 @@ def study_text(results: StudyResults) -> str:
 
 
 def primary(rows: Sequence[Row]) -> list[Row]:
-    """The rows that have intervals: the mean over the grid of sigmas, or the first sigma."""
-    if any(row["sigma"] == MEAN for row in rows):
-        return [row for row in rows if row["sigma"] == MEAN]
-    first = rows[0]["sigma"]
-    return [row for row in rows if row["sigma"] == first]
+    """The rows that have intervals: those of the first sigma, or of the mean over the grid of them.
+
+    The latter say how stale answers are at the first sigma.
+    """
+    keys = ("trace", "forecaster", *SETTINGS)
+    first: dict[tuple[Any, ...], Row] = {}
+    last: dict[tuple[Any, ...], Row] = {}
+    for row in rows:
+        key = tuple(row[name] for name in keys)
+        first.setdefault(key, row)
+        last[key] = row
+    grid = any(row["sigma"] == MEAN for row in rows)
+    return [{**first[key], **last[key]} if grid else first[key] for key in first]
 
 
 def several(rows: Sequence[Row]) -> list[str]:
@@ -53,7 +61,7 @@ def several(rows: Sequence[Row]) -> list[str]:
 
 def ranking(rows: Sequence[Row]) -> str:
     """A line per trace, setting and forecaster, the best AUC of a setting first."""
-    differ = several(rows)
+    differ = ["dataset"] * (len({row["dataset"] for row in rows}) > 1) + several(rows)
     header = [
         *differ,
         "trace",

@@ -47,14 +47,8 @@ class View:
 
     @cached_property
     def rows(self) -> list[Row]:
-        """Rows with intervals; those of means over sigma say how stale answers are at the first."""
-        first: dict[tuple[str, ...], Row] = {}
-        for row in self.results.summary:
-            first.setdefault((run_of(row), *setting_of(row), row["forecaster"]), row)
-        return [
-            {**first[(run_of(row), *setting_of(row), row["forecaster"])], **row}
-            for row in primary(self.results.summary)
-        ]
+        """Rows with intervals (see :func:`lae_sim.study_text.primary`)."""
+        return primary(self.results.summary)
 
     @cached_property
     def chosen(self) -> dict[str, tuple[str, ...]]:
