@@ -16,6 +16,8 @@ from lae_sim.metadata import Metadata
 from lae_sim.pairing import SIGMA_GRID
 from lae_sim.recording import Recording
 from lae_sim.run import replay_sequence
+from lae_sim.study_file import Study
+from lae_sim.study_run import run_study
 from lae_sim.trace import Trace, read_trace, write_trace
 from lae_sim.zoo import load_forecaster
 
@@ -106,6 +108,34 @@ def test_nanotrack_over_the_grid_of_permitted_latencies(nanotrack: Trace) -> Non
     runs = [replay_sequence(recording, CLOCK, source) for recording in nanotrack]
     found = evaluate(runs, METADATA, FORECASTERS, SIGMA_GRID)
     assert means(found) == {"hold": (0.4560, 0.6086), "kalman": (0.5485, 0.7475)}
+
+
+def test_studies_reach_the_same_figures_in_batches(
+    ortrack: Trace, nanotrack: Trace, tmp_path: Path
+) -> None:
+    write_trace(nanotrack, tmp_path / "nano.parquet")
+    write_trace(ortrack, tmp_path / "ortrack.parquet")
+    nano = Study((str(tmp_path / "nano.parquet"),), sigmas=SIGMA_GRID)
+    scales = (Fraction(1), Fraction(2), Fraction(4))
+    slower = Study((str(tmp_path / "ortrack.parquet"),), scales=scales)
+    rows = [
+        *run_study(nano, tmp_path / "a", workers=1).summary,
+        *run_study(slower, tmp_path / "b", workers=1).summary,
+    ]
+    assert {row["engine"] for row in rows} == {"batch"}
+    found = {
+        (row["trace"], row["scale"], row["sigma"], row["forecaster"]): (
+            round(row["auc"], 4),
+            round(row["dp20"], 4),
+        )
+        for row in rows
+    }
+    assert found["nano", "1", "mean", "hold"] == (0.4560, 0.6086)
+    assert found["nano", "1", "mean", "kalman"] == (0.5485, 0.7475)
+    assert found["nano", "1", "0", "kalman"] == (0.5300, 0.7221)
+    assert found["ortrack", "1", "0", "hold"] == (0.5013, 0.6930)
+    assert found["ortrack", "2", "0", "kalman"] == (0.4929, 0.7025)
+    assert found["ortrack", "4", "0", "kalman"] == (0.4682, 0.6838)
 
 
 def test_offline_values_do_not_depend_on_latency(nanotrack: Trace) -> None:
