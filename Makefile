@@ -19,6 +19,7 @@ lint: $(VENV)/.dev  ## format, lint and types
 bench: $(VENV)/.test  ## measure speed and memory
 	$(BIN)/python benchmarks/run.py
 	$(BIN)/python benchmarks/profiling.py
+	$(BIN)/python benchmarks/study.py
 
 samples: $(VENV)/.demo  ## make the sample traces anew
 	$(BIN)/python traces/make_samples.py

@@ -1,0 +1,268 @@
+"""Speed and memory of studies: ``make bench`` or ``python benchmarks/study.py``.
+
+Whole processes stand beside a process that reads the same Parquet files, random latencies beside
+the SimPy engine on the same times. Seconds are those of the clock, and of all cores together (user
+and system). The input has the size of UAV123: 123 sequences, 112,578 frames for each tracker.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import partial
+from itertools import count
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+from run import CLOCK, FRAMES, lengths, medians, recordings
+
+from lae_sim import Metadata, Recording, Trace, latest, simulate, write_trace
+from lae_sim.batch import simulate_lanes
+from lae_sim.evaluation import evaluate_groups
+from lae_sim.forecast import Hold
+from lae_sim.latency import Times, bootstrap
+from lae_sim.report import table
+from lae_sim.run import replay_repeated
+
+RATES = (15, 20, 25, 30, 40, 50, 60, 90)  # frames/s of the trackers
+REPETITIONS = 81  # 9,963 lanes
+READ = """
+import sys
+import pyarrow.parquet as pq
+for path in sys.argv[1:]:
+    pq.ParquetFile(path).read()
+"""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a process took: seconds, and peak memory in MiB of it and of its largest worker."""
+
+    wall: float
+    cpu: float
+    parent: float
+    worker: float
+
+
+def process(*arguments: str) -> Cost:
+    """Run Python to its end (memory: Linux)."""
+    start = time.perf_counter()
+    command = [sys.executable, *arguments]
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    peaks: dict[int, float] = {}
+    while not (ended := os.wait4(running.pid, os.WNOHANG))[0]:
+        for pid in (running.pid, *_children(running.pid)):
+            peaks[pid] = max(_peak(pid), peaks.get(pid, 0.0))
+        time.sleep(0.005)
+    wall, used = time.perf_counter() - start, ended[2]
+    running.returncode = os.waitstatus_to_exitcode(ended[1])
+    if running.returncode:
+        raise SystemExit(f"{' '.join(command)}: status {running.returncode}")
+    parent = peaks.pop(running.pid, 0.0)
+    return Cost(wall, used.ru_utime + used.ru_stime, parent, max(peaks.values(), default=0.0))
+
+
+def _children(pid: int) -> list[int]:
+    try:
+        return [int(n) for n in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+def _peak(pid: int) -> float:
+    """The high-water mark of one process, MiB."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return 0.0
+    return sum(int(line.split()[1]) / 1024 for line in status.splitlines() if "VmHWM" in line)
+
+
+def in_turn(works: dict[str, Callable[[], Cost]], rounds: int) -> dict[str, Cost]:
+    """The medians of each, measured in turn."""
+    taken: dict[str, list[Cost]] = {name: [] for name in works}
+    for _ in range(rounds):
+        for name, work in works.items():
+            taken[name].append(work())
+    return {
+        name: Cost(*(median(column) for column in zip(*(vars(c).values() for c in costs))))
+        for name, costs in taken.items()
+    }
+
+
+def write_tracker(path: Path, rate: int, jitter: float, times: int = 1) -> str:
+    """Write the trace of a tracker of so many frames/s on a multiple of UAV123's sequences."""
+    rng = np.random.default_rng(rate)
+
+    def tracked(recording: Recording) -> Recording:
+        factors = rng.lognormal(0, jitter, len(recording)) if jitter else np.ones(len(recording))
+        return replace(recording, elapsed_ns=(1e9 / rate * factors).astype(np.int64))
+
+    sizes = np.tile(lengths(), times)
+    metadata = Metadata.new("30", "every-frame", tracker={"name": f"tracker-{rate}"})
+    write_trace(Trace(metadata, map(tracked, recordings(sizes))), path)
+    return str(path)
+
+
+def study(
+    folder: Path, traces: Sequence[str], forecasters: Sequence[str], *options: str
+) -> Callable[[], Cost]:
+    """A whole study of traces over the grid of permitted latencies, from nothing."""
+    number = count()
+    file = folder / f"{len(list(folder.glob('*.toml')))}.toml"
+    text = f'traces = {list(traces)}\nforecasters = {list(forecasters)}\nsigma = "grid"\n'
+    file.write_text(text.replace("'", '"'))
+
+    def work() -> Cost:
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            where = str(Path(out) / str(next(number)))
+            return process(
+                "-m", "lae_sim.study", str(file), "--no-report", "--out", where, *options
+            )
+
+    return work
+
+
+def whole_lines(folder: Path, rounds: int) -> list[list[str]]:
+    """Eight traces, 51 sigmas: the floor, hold, and hold and kalman."""
+    targets = {"hold": "<= 1.5", "hold + kalman": "<= 4"}
+    found = []
+    for kind, jitter in (("constant times", 0.0), ("times jitter by 10 %", 0.1)):
+        traces = [
+            write_tracker(folder / f"{kind[0]}{rate}.parquet", rate, jitter) for rate in RATES
+        ]
+        works = {
+            "read the Parquet files": partial(process, "-c", READ, *traces),
+            "hold": study(folder, traces, ["hold"]),
+            "hold + kalman": study(folder, traces, ["hold", "kalman"]),
+        }
+        taken = in_turn(works, rounds)
+        floor = taken["read the Parquet files"].wall
+        found += [
+            [f"8 traces, 51 sigmas, {kind}", name, f"{cost.wall:.2f} s", f"{cost.cpu:.2f} s"]
+            + [f"{cost.worker:.0f}, {cost.parent:.0f}", f"{cost.wall / floor:.1f} x floor"]
+            + [targets.get(name, "")]
+            for name, cost in taken.items()
+        ]
+    return found
+
+
+def worker_lines(folder: Path, rounds: int) -> list[list[str]]:
+    """The same study with 1, 2, 4, ... workers."""
+    traces = [str(folder / f"t{rate}.parquet") for rate in RATES]
+    cores = len(os.sched_getaffinity(0))
+    counts = [*(2**k for k in range(10) if 2**k < cores), cores]
+    works = {n: study(folder, traces, ["hold", "kalman"], "--workers", str(n)) for n in counts}
+    taken = in_turn({str(n): work for n, work in works.items()}, rounds)
+    first = next(iter(taken.values()))
+    return [
+        ["8 traces, times jitter by 10 %, hold + kalman", f"{name} workers", f"{cost.wall:.2f} s"]
+        + [f"{cost.cpu:.2f} s", f"{cost.worker:.0f}, {cost.parent:.0f}"]
+        + [f"{first.wall / cost.wall:.2f} x as fast", ""]
+        for name, cost in taken.items()
+    ]
+
+
+def size_lines(folder: Path, rounds: int, largest: int) -> list[list[str]]:
+    """One trace of 1, 10, 100 times as many sequences."""
+    found = []
+    base = Cost(1, 1, 1, 1)
+    for times in (1, 10, 100):
+        if times > largest:
+            break
+        # a slow tracker: its 51 sigmas have 51 histories as a rule, so that groups are full
+        trace = write_tracker(folder / f"x{times}.parquet", 20, 0.1, times)
+        work = study(folder, [trace], ["hold", "kalman"], "--workers", "2")
+        cost = in_turn({"": work}, rounds if times == 1 else 1)[""]
+        base = cost if times == 1 else base
+        ratios = f"{cost.worker / base.worker:.2f}, {cost.parent / base.parent:.2f} x memory"
+        found += [
+            [f"one trace, {123 * times:,} sequences", "hold + kalman", f"{cost.wall:.2f} s"]
+            + [f"{cost.cpu:.2f} s", f"{cost.worker:.0f}, {cost.parent:.0f}", ratios, "flat"]
+        ]
+        os.unlink(trace)
+    return found
+
+
+def lane_lines(rounds: int) -> list[list[str]]:
+    """Random latencies: million world frames a second."""
+    metadata = Metadata.new("30", "every-frame")
+    trace = Trace(metadata, list(recordings(lengths())))
+    source = bootstrap(0)
+    every = [
+        Times(recording.name, ns, by_call=True)
+        for recording in trace
+        for ns in source.repeated(recording, 0, REPETITIONS)
+    ]
+    sizes = [len(times.ns) for times in every]
+    one = slice(None, None, REPETITIONS)
+
+    def simpy() -> None:
+        for size, times in zip(sizes[one], every[one]):
+            # fresh: it remembers how many it has handed out
+            simulate(size, CLOCK, replace(times), latest)
+
+    def runs() -> Iterator[tuple[int, object]]:
+        return replay_repeated(trace, source, REPETITIONS)
+
+    def scored() -> None:
+        those = (run for _, run in replay_repeated(trace, source, REPETITIONS))
+        for _ in evaluate_groups(those, metadata, {"hold": Hold}, (Fraction(0),), frames=1 << 17):
+            pass
+
+    def exhaust(make: Callable[[], Iterator[object]]) -> None:
+        for _ in make():
+            pass
+
+    works = {
+        "SimPy, schedule alone": simpy,
+        "schedule alone": lambda: exhaust(lambda: simulate_lanes(sizes, CLOCK, every, latest)),
+        "and bootstrap's draws, boxes": lambda: exhaust(runs),
+        "and scores, hold": scored,
+    }
+    taken = medians(works, rounds)
+    speed = {
+        name: FRAMES * (1 if "SimPy" in name else REPETITIONS) / seconds / 1e6
+        for name, seconds in taken.items()
+    }
+    return [
+        [f"random latencies, {len(every):,} lanes", name, f"{rate:.2f} M frames/s", "", ""]
+        + [f"{rate / speed['SimPy, schedule alone']:.1f} x SimPy"]
+        + [">= 30" if name == "schedule alone" else ""]
+        for name, rate in speed.items()
+    ]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--rounds", type=int, default=3, help="measurements of each (default: 3)")
+    parser.add_argument(
+        "--largest", type=int, default=10, help="times UAV123, for the memory: 1, 10 or 100"
+    )
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        found = whole_lines(folder, arguments.rounds)
+        found += worker_lines(folder, arguments.rounds)
+        found += size_lines(folder, arguments.rounds, arguments.largest)
+    found += lane_lines(arguments.rounds)
+    head = ["what", "how", "median", "all cores", "MiB: worker, parent", "ratio", "target"]
+    print(table(head, found))
+    print(
+        "\nPublished results have a mean fps, so constant times. Where times jitter around a "
+        "multiple of\nthe frame interval, each sigma has a history of its own for kalman: up to 51 "
+        "times the work."
+    )
+
+
+if __name__ == "__main__":
+    main()
