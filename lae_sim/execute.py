@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager
@@ -166,8 +167,9 @@ def local_executor(workers: int) -> Iterator[Executor]:
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    # not a fork: libraries here have threads
-    with ProcessPoolExecutor(workers, get_context("spawn")) as executor:
+    # not a fork: libraries here have threads; Ctrl-C is for this process alone
+    ignore = (signal.signal, (signal.SIGINT, signal.SIG_IGN))
+    with ProcessPoolExecutor(workers, get_context("spawn"), *ignore) as executor:
         try:
             yield executor
         except BaseException:

@@ -43,6 +43,11 @@ class EveryOther:
 
 policy = EveryOther()
 
+class Deadly:
+    def __init__(self, box, image_size=None):
+        import os
+        os.kill(os.getpid(), 9)
+
 class Stay:
     def __init__(self, box, image_size=None):
         self.box = box
@@ -410,6 +415,15 @@ def test_an_own_policy_is_replayed_in_simpy_which_is_said(
     every = run(tmp_path / "every", policies=("every:2",))
     own = [row["auc"] for row in results.summary if row["engine"] == "simpy"]
     assert own == [row["auc"] for row in every.summary]
+
+
+def test_a_worker_that_dies_is_told_in_a_line(tmp_path: Path) -> None:
+    (tmp_path / "deadly_of_study.py").write_text(OWN)
+    path = toml(tmp_path, forecasters=["deadly_of_study:Deadly"], scales=[1, 2])
+    told = study_command(path, "--workers", 2, cwd=tmp_path, status=2)
+    assert "a worker died" in told
+    assert "the same command goes on from there" in told
+    assert told.count("\n") == 1
 
 
 @pytest.mark.parametrize(
