@@ -9,7 +9,13 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-PICTURES = {"01_replay_a_trace": 3, "02_profile_your_device": 4, "03_compare_forecasters": 7}
+PICTURES = {
+    "01_replay_a_trace": 3,
+    "02_profile_your_device": 4,
+    "03_compare_forecasters": 7,
+    "04_full_study": 4,
+}
+IMAGES = {"image/png", "image/svg+xml"}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -20,7 +26,7 @@ def test_notebook_runs(path, monkeypatch):
     resources = {"metadata": {"path": str(path.parent)}}
     NotebookClient(notebook, timeout=120, resources=resources).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
-    pictures = [output for output in outputs if "image/png" in output.get("data", {})]
+    pictures = [output for output in outputs if IMAGES & {*output.get("data", {})}]
     assert len(pictures) == PICTURES[path.stem]
     assert not [output for output in outputs if output.get("name") == "stderr"]
 
