@@ -27,7 +27,7 @@ from lae_sim.notes import notes_on
 from lae_sim.options import parse_latency, parse_policy
 from lae_sim.run import Run, replay_repeated, replay_trace
 from lae_sim.study_file import RANDOM
-from lae_sim.trace import read_trace
+from lae_sim.trace import Trace, read_trace
 
 VERSION = 1
 """Of the cells' files; another version is another cell."""
@@ -216,7 +216,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
     chosen = {cell.forecaster: factories[cell.forecaster] for cell in cells}
     costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
     writers = [_Rows(cell, trace.metadata.tracker, trace.metadata.dataset) for cell in cells]
-    replay = replayed(setting)
+    replay = replayed(setting, trace)
     repetitions: list[int] = []
 
     def runs() -> Iterator[Run]:
@@ -371,9 +371,14 @@ class Replayed:
     engine: str
 
 
-def replayed(setting: Setting) -> Replayed:
-    """Replay a setting: its sequences and repetitions at once, where that is possible."""
-    trace = read_trace(setting.trace.path, setting.sequences or None)
+def replayed(setting: Setting, trace: Trace | None = None) -> Replayed:
+    """Replay a setting: its sequences and repetitions at once, where that is possible.
+
+    Args:
+        setting: which trace, and how.
+        trace: the trace, if it has been read already.
+    """
+    trace = trace or read_trace(setting.trace.path, setting.sequences or None)
     timing = None if setting.timing is None else read_trace(setting.timing.path)
     policy, _ = parse_policy(setting.policy)
     source = scaled(_source(setting), setting.scale)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -12,13 +12,16 @@ import numpy as np
 
 from lae_sim.cells import Cell, replayed
 from lae_sim.evaluation import evaluate_groups
-from lae_sim.forecast import AnyFactory
+from lae_sim.forecast import AnyFactory, Hold
 from lae_sim.metrics import find_convention
-from lae_sim.trace import read_trace
+from lae_sim.trace import Trace, read_trace
 
 STEP = Fraction(1, 100)
 MOST = 1 << 13
 """Scales are looked for in hundredths, up to 81.92 times slower."""
+
+HELD = 1_000_000
+"""World frames of a trace that is kept in memory for a search; a larger one is read each time."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +30,13 @@ class Search:
 
     Attributes:
         cell: what is replayed, at other scales than its own, at its first sigma.
-        factory: its forecaster.
         required: the mean AUC.
+        factory: the cell's forecaster.
     """
 
     cell: Cell
-    factory: AnyFactory
     required: Fraction
+    factory: AnyFactory = Hold
 
     @property
     def key(self) -> str:
@@ -42,15 +45,13 @@ class Search:
         return hashlib.sha256(told.encode()).hexdigest()[:32]
 
 
-def searches(
-    cells: Sequence[Cell], factories: Mapping[str, AnyFactory], required: Fraction
-) -> list[Search]:
+def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
     """One search for all cells that differ in their scale or repetitions alone."""
     found: dict[str, Search] = {}
     for cell in cells:
         setting = replace(cell.setting, scale=Fraction(1), first=0, sigmas=cell.setting.sigmas[:1])
         if cell.setting.first == 0:
-            search = Search(replace(cell, setting=setting), factories[cell.forecaster], required)
+            search = Search(replace(cell, setting=setting), required)
             found.setdefault(search.key, search)
     return list(found.values())
 
@@ -67,10 +68,14 @@ def slowest(search: Search) -> dict[str, Any]:
         is too low, ``beyond`` if it is enough at the largest scale that is tried.
     """
     known: dict[int, float] = {}
+    setting = search.cell.setting
+    trace = read_trace(setting.trace.path, setting.sequences or None)
+    if trace.frames is not None and trace.frames <= HELD:
+        trace = replace(trace, recordings=list(trace))
 
     def enough(step: int) -> bool:
         if step not in known:
-            known[step] = mean_auc(search, step * STEP)
+            known[step] = mean_auc(search, step * STEP, trace)
         return known[step] >= search.required
 
     found: dict[str, Any] = dict.fromkeys(("scale", "auc", "beyond", "beyond_auc"))
@@ -89,14 +94,13 @@ def slowest(search: Search) -> dict[str, Any]:
     return {**found, "auc_without_latency": known[0]}
 
 
-def mean_auc(search: Search, scale: Fraction) -> float:
+def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
     """The mean AUC over sequences and repetitions at a scale of all times."""
     cell = search.cell
     setting = replace(cell.setting, scale=scale)
-    metadata = read_trace(setting.trace.path).metadata
-    parts: Iterator[Any] = evaluate_groups(
-        (run for _, run in replayed(setting).runs),
-        metadata,
+    parts = evaluate_groups(
+        (run for _, run in replayed(setting, trace).runs),
+        trace.metadata,
         {cell.forecaster: search.factory},
         setting.sigmas,
         find_convention(cell.convention),

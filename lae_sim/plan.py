@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -16,12 +16,12 @@ from lae_sim.costs import resolve_costs
 from lae_sim.errors import LaeError
 from lae_sim.examples import Trainer
 from lae_sim.files import labels
-from lae_sim.forecast import AnyFactory
+from lae_sim.forecast import AnyFactory, Hold
 from lae_sim.locate import digest, find_traces
 from lae_sim.metadata import Metadata
 from lae_sim.options import parse_latency, parse_policy
 from lae_sim.study_file import RANDOM, Study
-from lae_sim.trace import Trace, read_trace
+from lae_sim.trace import read_trace
 from lae_sim.zoo import load_any
 
 CHUNK_FRAMES = 2_000_000
@@ -51,39 +51,48 @@ class Plan:
         study: what was asked for.
         sources: its traces, and those of other devices' times.
         cells: in the order of the tables.
-        factories: forecasters by name, trained where they must be.
-        notes: what to say of the training.
+        forecasters: factories by name, and trainers of those that must be trained.
+        training: digest of all that the training depends on.
     """
 
     study: Study
     sources: tuple[Source, ...]
     cells: tuple[Cell, ...]
-    factories: Mapping[str, AnyFactory]
-    notes: tuple[str, ...]
+    forecasters: Mapping[str, AnyFactory | Trainer]
+    training: str
 
-    def tasks(self, done: Callable[[Cell], bool]) -> list[Task]:
-        """The cells that are not done, those of one setting together."""
-        together: dict[Setting, list[Cell]] = {}
-        for cell in self.cells:
-            if not done(cell):
-                together.setdefault(cell.setting, []).append(cell)
-        return [
-            Task(tuple(cells), {cell.forecaster: self.factories[cell.forecaster] for cell in cells})
-            for cells in together.values()
-        ]
+    @property
+    def trainers(self) -> list[str]:
+        """Names of the forecasters that must be trained."""
+        return [name for name, each in self.forecasters.items() if isinstance(each, Trainer)]
+
+    def trained(
+        self, progress: Callable[[str], object] = lambda what: None
+    ) -> tuple[dict[str, AnyFactory], list[str]]:
+        """Train, across folds, on replays with the recorded and constant times of the study.
+
+        Returns:
+            A factory for each forecaster, and what to say of the training.
+        """
+        study, wanted = self.study, self.study.sequences or None
+        own = {cell.setting.trace: None for cell in self.cells}
+        read = {each.label: read_trace(each.path, wanted) for each in own}
+        fixed = [name for name in study.latencies if name not in RANDOM] or ["recorded"]
+        world = World(
+            {name: parse_latency(name) for name in fixed},
+            study.scales,
+            study.fps[0],
+            parse_policy(study.policies[0])[0],
+        )
+        return fitted(read, self.forecasters, world, study.folds, study.seed, progress)
 
 
-def make_plan(
-    study: Study,
-    base: Path | None = None,
-    progress: Callable[[str], object] = lambda what: None,
-) -> Plan:
-    """Find the traces, train what must be trained, and list the cells.
+def make_plan(study: Study, base: Path | None = None) -> Plan:
+    """Find the traces, and list the cells.
 
     Args:
         study: what is asked for.
         base: the folder that relative paths are from; the current one by default.
-        progress: told what is done next.
 
     Raises:
         LaeError: if a trace is missing or damaged, or there is no such forecaster.
@@ -96,21 +105,30 @@ def make_plan(
         found = Input(path, label.removesuffix(".parquet"), digest(path))
         sources[path] = Source(found, trace.metadata, trace.frames or 0)
     traces, timing = [sources[path] for path in own], [sources[path] for path in timed]
-    asked = {name: load_any(name) for name in dict.fromkeys(["hold", *study.forecasters])}
-    factories, notes = _trained(study, traces, asked, progress)
-    codes = {
-        name: _code(name, factory, study, traces, isinstance(asked[name], Trainer))
-        for name, factory in factories.items()
-    }
-    costs = resolve_costs(study.costs, factories, ())
+    names = dict.fromkeys(["hold", *study.forecasters])
+    forecasters = {name: load_any(name) for name in names}
+    training = _training(study, traces)
+    codes = {name: _code(name, each, training) for name, each in forecasters.items()}
+    costs = resolve_costs(study.costs, dict.fromkeys(names, Hold), ())  # none is measured
     cells = [
         Cell(setting, name, codes[name], costs.get(name, 0), convention)
         for source in traces
         for setting in _settings(study, source, timing)
         for convention in study.conventions
-        for name in factories
+        for name in forecasters
     ]
-    return Plan(study, tuple(sources.values()), tuple(cells), factories, tuple(notes))
+    return Plan(study, tuple(sources.values()), tuple(cells), forecasters, training)
+
+
+def tasks(cells: Iterable[Cell], factories: Mapping[str, AnyFactory]) -> list[Task]:
+    """The cells of each setting together."""
+    together: dict[Setting, list[Cell]] = {}
+    for cell in cells:
+        together.setdefault(cell.setting, []).append(cell)
+    return [
+        Task(tuple(some), {cell.forecaster: factories[cell.forecaster] for cell in some})
+        for some in together.values()
+    ]
 
 
 def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Setting]:
@@ -151,41 +169,24 @@ def _same_runs(source: Source, other: Source) -> bool:
     return same and source.input.path != other.input.path
 
 
-def _trained(
-    study: Study,
-    traces: Sequence[Source],
-    asked: Mapping[str, AnyFactory | Trainer],
-    progress: Callable[[str], object],
-) -> tuple[dict[str, AnyFactory], list[str]]:
-    """Train across folds what must be trained, on replays with recorded or constant times."""
-    wanted = study.sequences or None
-    read: dict[str, Trace] = {s.input.label: read_trace(s.input.path, wanted) for s in traces}
-    fixed = [name for name in study.latencies if name not in RANDOM] or ["recorded"]
-    world = World(
-        {name: parse_latency(name) for name in fixed},
-        study.scales,
-        study.fps[0],
-        parse_policy(study.policies[0])[0],
-    )
-    return fitted(read, asked, world, study.folds, study.seed, progress)
+def _training(study: Study, traces: Sequence[Source]) -> str:
+    """Digest of what trained forecasters depend on."""
+    document = study.document()
+    keys = ("latencies", "scales", "fps", "policies", "sequences", "folds", "seed")
+    told = [*(document[key] for key in keys), *(source.input.digest for source in traces)]
+    return hashlib.sha256(repr(told).encode()).hexdigest()[:32]
 
 
-def _code(
-    name: str, factory: AnyFactory, study: Study, traces: Sequence[Source], trained: bool
-) -> str:
-    """What else a forecaster's figures depend on: its file, its code, or what it was trained on."""
+def _code(name: str, forecaster: AnyFactory | Trainer, training: str) -> str:
+    """What else a forecaster's figures depend on: its file, its code, its training."""
     kind, _, value = name.partition(":")
     if kind == "learned" and value:
         return digest(value)
-    if trained:
-        document = study.document()
-        told = [document[key] for key in ("latencies", "scales", "fps", "policies", "sequences")]
-        found = [source.input.digest for source in traces]
-        return hashlib.sha256(repr([told, found, study.folds, study.seed]).encode()).hexdigest()
-    module = sys.modules.get(getattr(factory, "__module__", type(factory).__module__))
+    told = training if isinstance(forecaster, Trainer) else ""
+    module = sys.modules.get(getattr(forecaster, "__module__", type(forecaster).__module__))
     if module is None or module.__name__.partition(".")[0] == "lae_sim":
-        return ""  # the version of the package says it
+        return told  # the version of the package says the rest
     try:
-        return digest(inspect.getsourcefile(module) or "")
-    except (TypeError, OSError, LaeError):
-        return ""
+        return told + digest(inspect.getsourcefile(module) or "")
+    except (TypeError, LaeError):
+        return told

@@ -8,10 +8,10 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
 from lae_sim.cells import Task, compute
@@ -19,7 +19,8 @@ from lae_sim.deployment import Search, requirement, searches, slowest
 from lae_sim.errors import LaeError
 from lae_sim.execute import Failure, Store, cluster_executor, local_executor, run_all
 from lae_sim.files import written_whole
-from lae_sim.plan import Plan, Source, make_plan
+from lae_sim.forecast import AnyFactory
+from lae_sim.plan import Plan, Source, make_plan, tasks
 from lae_sim.study_file import Study
 from lae_sim.study_pairs import compare_traces
 from lae_sim.study_summary import Row, Scores, read_scores, summarise_study
@@ -42,6 +43,7 @@ class StudyResults:
         traces: what ``lae-sim show --json`` says of each trace.
         computed: how many cells were computed now, and not found finished.
         failures: what could not be computed, and why.
+        training: what to say of the forecasters that were trained.
     """
 
     folder: Path
@@ -53,6 +55,7 @@ class StudyResults:
     traces: tuple[Row, ...]
     computed: int
     failures: tuple[Row, ...]
+    training: tuple[str, ...] = ()
 
     def table(self) -> DataFrame:
         """Every score of every sequence, repetition and sigma (columns: ``lae_sim.cells``)."""
@@ -67,7 +70,7 @@ class StudyResults:
         told = [note for scores in self.scores for about in scores.about for note in about["notes"]]
         of_traces = [f"{trace['trace']}: {text}" for trace in self.traces
                      for text in trace["warnings"]]  # fmt: skip
-        return list(dict.fromkeys([*self.plan.notes, *told, *of_traces]))
+        return list(dict.fromkeys([*self.training, *told, *of_traces]))
 
     def document(self) -> dict[str, Any]:
         """All but the scores of single sequences, as ``study.json`` holds it."""
@@ -108,17 +111,19 @@ def run_study(
     Raises:
         LaeError: if the study cannot be planned, nothing could be computed, or a worker died.
     """
-    plan = make_plan(study, base, lambda what: progress(what, 0, 1))
+    plan = make_plan(study, base)
     store = Store(folder)
     store.prepare(plan.cells)
-    asked = [] if study.require_auc is None else searches(
-        plan.cells, plan.factories, study.require_auc
-    )  # fmt: skip
+    asked = [] if study.require_auc is None else searches(plan.cells, study.require_auc)
     described = [_About(source, study.sequences) for source in plan.sources]
+    cells = [cell for cell in plan.cells if not store.has(cell)]
+    sought = [search for search in asked if store.found(search.key) is None]
+    needed = {*(cell.forecaster for cell in cells), *(each.cell.forecaster for each in sought)}
+    factories, training = _factories(plan, needed, store, lambda what: progress(what, 0, 1))
     works: list[_About | Task | Search] = [
         *(about for about in described if store.found(about.key) is None),
-        *plan.tasks(store.has),
-        *(search for search in asked if store.found(search.key) is None),
+        *tasks(cells, factories),
+        *(replace(search, factory=factories[search.cell.forecaster]) for search in sought),
     ]
     failures, computed = [], 0
     count = min(workers or _cores(), max(len(works), 1))
@@ -150,9 +155,24 @@ def run_study(
         traces=tuple(found for about in described if (found := store.found(about.key))),
         computed=computed,
         failures=tuple(sorted(failures, key=str)),
+        training=tuple(training),
     )
     _write(results)
     return results
+
+
+def _factories(
+    plan: Plan, needed: set[str], store: Store, progress: Callable[[str], object]
+) -> tuple[dict[str, AnyFactory], list[str]]:
+    """A factory for each forecaster needed, and what to say of training, now or before."""
+    key = f"{plan.training}-training"
+    if needed.isdisjoint(plan.trainers):
+        kept = {name: each for name, each in plan.forecasters.items() if name in needed}
+        told = store.found(key) if plan.trainers else None
+        return cast(dict[str, AnyFactory], kept), (told or {}).get("notes", [])
+    factories, notes = plan.trained(progress)
+    store.keep(key, {"notes": notes})
+    return factories, notes
 
 
 @dataclass(frozen=True)

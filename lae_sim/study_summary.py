@@ -298,10 +298,11 @@ def _median_survival(times: Floats, failed: Any, frame_ms: float) -> float | Non
     Sequences that end without failure are censored: the estimate is that of Kaplan and Meier,
     "Nonparametric Estimation from Incomplete Observations", 1958.
     """
-    alive = 1.0
+    alive = Fraction(1)
     for time in np.unique(times[failed]):
-        alive *= 1 - np.count_nonzero(failed & (times == time)) / np.count_nonzero(times >= time)
-        if alive <= 0.5:
+        lost = np.count_nonzero(failed & (times == time))
+        alive *= 1 - Fraction(int(lost), int(np.count_nonzero(times >= time)))
+        if alive <= Fraction(1, 2):
             return float(time) * frame_ms
     return None
 

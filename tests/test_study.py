@@ -26,6 +26,7 @@ from lae_sim.pairing import SIGMA_GRID
 from lae_sim.study import main
 from lae_sim.study_file import Study
 from lae_sim.study_run import StudyResults, run_study
+from lae_sim.training import KalmanTrainer
 
 ROOT = Path(__file__).parents[1]
 SLOW = ROOT / "traces" / "synthetic-slow.parquet"
@@ -301,6 +302,22 @@ def test_the_code_of_an_own_forecaster_is_an_input(
         assert expected in study_command(path, "--no-report", cwd=tmp_path)
     (tmp_path / "own_of_study.py").write_text(OWN + "# changed\n")
     assert "1 of them computed" in study_command(path, "--no-report", cwd=tmp_path)
+
+
+def test_what_is_trained_is_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = Study((str(SLOW),), forecasters=("tuned-kalman",))
+    results = run(tmp_path, study)
+    notes = results.notes()
+    assert any("trained in 5 folds over 8 sequences" in note for note in notes)
+    table = lae_sim.compare({"slow": lae_sim.read_trace(SLOW)}, {"tuned-kalman": KalmanTrainer()})
+    scores = table.query("forecaster == 'tuned-kalman' and metric == 'auc'").set_index("sequence")
+    found = results.table().query("forecaster == 'tuned-kalman'").set_index("sequence")
+    assert found["auc"].to_dict() == scores["value"].to_dict()
+    monkeypatch.setattr("lae_sim.plan.fitted", None)
+    again = run(tmp_path, study)
+    assert (again.computed, again.notes()) == (0, notes)
 
 
 def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
