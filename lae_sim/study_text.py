@@ -141,7 +141,8 @@ def requirements(rows: Sequence[Row]) -> str:
         + [number(row["auc"]), number(row["speed_up"], ".2f"), number(row["fps_at_most"], ".1f")]
         for row in rows
     ]
-    return table(header, lines, 4) + "\ntimes at most: by bisection, in steps of 0.01"
+    told = f"\ntimes at most: by bisection, in steps of 0.01; sigma {rows[0]['sigma']}"
+    return table(header, lines, 4) + told
 
 
 def eval_scale(text: str) -> float:
