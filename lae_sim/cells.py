@@ -7,7 +7,6 @@ again, and one whose input has changed is not. Cells of the same replay are comp
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from lae_sim import __version__
-from lae_sim.arrow import from_numpy, from_texts
 from lae_sim.batch import batchable
+from lae_sim.cell_rows import CellRows
 from lae_sim.evaluation import Evaluation, evaluate_groups
 from lae_sim.forecast import AnyFactory
 from lae_sim.latency import LatencySource, RandomSource, bootstrap, scaled
+from lae_sim.metadata import Metadata
 from lae_sim.metrics import METRICS, find_convention
 from lae_sim.notes import notes_on
 from lae_sim.options import parse_latency, parse_policy
@@ -58,6 +58,7 @@ class Setting:
     Attributes:
         trace: the boxes and the truth.
         timing: another device's trace that the times come from.
+        code: of a user's own policy or latency, a digest of its file.
         policy, latency: names.
         fps: world frame rate.
         scale: exact factor on all times.
@@ -69,6 +70,7 @@ class Setting:
 
     trace: Input
     timing: Input | None
+    code: str
     policy: str
     fps: Fraction
     latency: str
@@ -85,6 +87,7 @@ class Setting:
         return {
             "trace": [self.trace.label, self.trace.digest],
             "timing": self.timing and [self.timing.label, self.timing.digest],
+            "code": self.code,
             "policy": self.policy,
             "fps": str(self.fps),
             "latency": self.latency,
@@ -130,6 +133,22 @@ class Cell:
         }
         return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:32]
 
+    def about(self, metadata: Metadata) -> dict[str, str]:
+        """The columns that are the same in all its rows."""
+        setting = self.setting
+        return {
+            "trace": setting.trace.label,
+            "tracker": metadata.tracker,
+            "dataset": metadata.dataset,
+            "times_from": (setting.timing or setting.trace).label,
+            "policy": setting.policy,
+            "fps": str(setting.fps),
+            "latency": setting.latency,
+            "scale": str(setting.scale),
+            "convention": self.convention,
+            "forecaster": self.forecaster,
+        }
+
 
 @dataclass(frozen=True)
 class Task:
@@ -150,47 +169,13 @@ class Result:
 
     Attributes:
         key: the cell's.
-        rows: a Parquet file, a row per sequence, repetition and sigma (see :data:`COLUMNS`).
+        rows: a Parquet file (see :mod:`lae_sim.cell_rows`).
         about: curves at the first sigma, how many outputs are approximate, the engine, notes.
     """
 
     key: str
     rows: bytes
     about: dict[str, Any]
-
-
-COLUMNS = {
-    "trace": "string",
-    "tracker": "string",
-    "dataset": "string",
-    "times_from": "string",
-    "policy": "string",
-    "fps": "string",
-    "latency": "string",
-    "scale": "string",
-    "convention": "string",
-    "forecaster": "string",
-    "sequence": "string",
-    "repetition": "int32",
-    "sigma": "float64",
-    "world_frames": "int32",
-    "processed": "int32",
-    "approximate_outputs": "int32",
-    "elapsed_ms": "float64",
-    "mismatch_mean": "float64",
-    "mismatch_max": "int32",
-    "longest_hold": "int32",
-    "failure_frame": "int32",
-    **dict.fromkeys(METRICS, "float64"),
-    **{f"offline_{metric}": "float64" for metric in METRICS},
-}
-"""Columns of the results, and their types.
-
-``elapsed_ms`` is the mean time of the calls but the initialisation, ``longest_hold`` and the
-mismatches are in frames, ``failure_frame`` is the first whose answer does not overlap the truth
-(``world_frames`` if there is none); scores are in 0..1, NaN where the sequence leaves the mean or,
-offline, where the trace lacks boxes.
-"""
 
 
 def compute(task: Task) -> list[Result]:
@@ -215,7 +200,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
     trace = read_trace(setting.trace.path, setting.sequences or None)
     chosen = {cell.forecaster: factories[cell.forecaster] for cell in cells}
     costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
-    writers = [_Rows(cell, trace.metadata.tracker, trace.metadata.dataset) for cell in cells]
+    writers = [CellRows(setting.sigmas, cell.about(trace.metadata)) for cell in cells]
     replay = replayed(setting, trace)
     repetitions: list[int] = []
 
@@ -290,72 +275,6 @@ class _Curves:
                 count = int(self._counts[name][which])
                 found[label] = (sums[which] / count).tolist() if count else None
         return found
-
-
-class _Rows:
-    """Writes the rows of one cell, group after group."""
-
-    def __init__(self, cell: Cell, tracker: str, dataset: str) -> None:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        setting = cell.setting
-        self._sigmas = np.array([float(sigma) for sigma in setting.sigmas])
-        self._constant = {
-            "trace": setting.trace.label,
-            "tracker": tracker,
-            "dataset": dataset,
-            "times_from": (setting.timing or setting.trace).label,
-            "policy": setting.policy,
-            "fps": str(setting.fps),
-            "latency": setting.latency,
-            "scale": str(setting.scale),
-            "convention": cell.convention,
-            "forecaster": cell.forecaster,
-        }
-        self._schema = pa.schema([pa.field(name, kind) for name, kind in COLUMNS.items()])
-        self._file = io.BytesIO()
-        texts = [name for name, kind in COLUMNS.items() if kind == "string"]
-        self._writer = pq.ParquetWriter(
-            self._file, self._schema, compression="zstd", use_dictionary=texts
-        )
-
-    def add(self, part: Evaluation, f: int, repetitions: Any) -> None:
-        """Add a row for each sequence of a part and each sigma."""
-        import pyarrow as pa
-
-        count = len(self._sigmas)
-        calls = np.maximum(part.processed - 1, 1)
-        once = {  # by sequence
-            "repetition": repetitions,
-            "world_frames": part.frames,
-            "processed": part.processed,
-            "approximate_outputs": part.departures,
-            "elapsed_ms": part.calls_ns / calls / 1e6,
-            **{f"offline_{metric}": part.offline[metric] for metric in METRICS},
-        }
-        values = {name: np.repeat(column, count) for name, column in once.items()}
-        values |= {  # by sequence and sigma
-            "mismatch_mean": (part.mismatch_sum / part.frames[:, None]).ravel(),
-            "mismatch_max": part.mismatch_max.ravel(),
-            "longest_hold": part.longest_hold.ravel(),
-            "failure_frame": part.failure[f].ravel(),
-            **{metric: part.scores[metric][f].ravel() for metric in METRICS},
-        }
-        values["sigma"] = np.tile(self._sigmas, len(part.sequences))
-        rows = len(values["sigma"])
-        columns = {
-            **{name: from_texts([text], rows) for name, text in self._constant.items()},
-            "sequence": from_texts(part.sequences, count),
-            **{name: from_numpy(column.astype(COLUMNS[name])) for name, column in values.items()},
-        }
-        arrays = [columns[name] for name in COLUMNS]
-        self._writer.write_batch(pa.record_batch(arrays, schema=self._schema))
-
-    def finish(self) -> bytes:
-        """The file's bytes."""
-        self._writer.close()
-        return self._file.getvalue()
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 from lae_sim.cells import Cell, Input, Setting, Task
 from lae_sim.comparison import World, fitted
@@ -139,22 +140,25 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
     for times, policy, fps, latency, scale in product(
         [None, *theirs], study.policies, rates, study.latencies, study.scales
     ):
-        repetitions = study.repetitions if latency in RANDOM else 1
         chunk = max(1, CHUNK_FRAMES // max(source.frames, 1))
+        random = latency in RANDOM
+        sourced = "" if random else _own_code(parse_latency(latency))
         setting = Setting(
             trace=source.input,
             timing=times,
+            code=_own_code(parse_policy(policy)[0]) + sourced,
             policy=policy,
             fps=fps,
             latency=latency,
             scale=scale,
             first=0,
             count=1,
-            seed=study.seed if latency in RANDOM else 0,
+            seed=study.seed if random else 0,
             block=study.block if latency == "bootstrap" else 0,
             sigmas=study.sigmas,
             sequences=tuple(sorted(study.sequences)),
         )
+        repetitions = study.repetitions if random else 1
         found += [
             replace(setting, first=first, count=min(chunk, repetitions - first))
             for first in range(0, repetitions, chunk)
@@ -182,11 +186,16 @@ def _code(name: str, forecaster: AnyFactory | Trainer, training: str) -> str:
     kind, _, value = name.partition(":")
     if kind == "learned" and value:
         return digest(value)
-    told = training if isinstance(forecaster, Trainer) else ""
-    module = sys.modules.get(getattr(forecaster, "__module__", type(forecaster).__module__))
+    # of the package itself, the version says it
+    return (training if isinstance(forecaster, Trainer) else "") + _own_code(forecaster)
+
+
+def _own_code(plug_in: Any) -> str:
+    """Digest of the file that a user's plug-in comes from; empty for those of the package."""
+    module = sys.modules.get(getattr(plug_in, "__module__", type(plug_in).__module__))
     if module is None or module.__name__.partition(".")[0] == "lae_sim":
-        return told  # the version of the package says the rest
+        return ""
     try:
-        return told + digest(inspect.getsourcefile(module) or "")
+        return digest(inspect.getsourcefile(module) or "")
     except (TypeError, LaeError):
-        return told
+        return ""

@@ -58,7 +58,7 @@ class StudyResults:
     training: tuple[str, ...] = ()
 
     def table(self) -> DataFrame:
-        """Every score of every sequence, repetition and sigma (columns: ``lae_sim.cells``)."""
+        """Every score of every sequence, repetition and sigma (see :mod:`lae_sim.cell_rows`)."""
         import pandas as pd
 
         store = Store(self.folder)

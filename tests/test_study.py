@@ -19,7 +19,7 @@ import pandas as pd
 import pytest
 
 import lae_sim
-from lae_sim import cells
+from lae_sim import cell_rows
 from lae_sim.errors import LaeError
 from lae_sim.latency import bootstrap, scaled
 from lae_sim.pairing import SIGMA_GRID
@@ -304,6 +304,17 @@ def test_the_code_of_an_own_forecaster_is_an_input(
     assert "1 of them computed" in study_command(path, "--no-report", cwd=tmp_path)
 
 
+def test_the_code_of_an_own_policy_is_an_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "code_of_study.py").write_text(OWN)
+    path = toml(tmp_path, traces=[str(FAST)], policies=["latest", "code_of_study:policy"])
+    for expected in ("4 of them computed", "0 of them computed"):
+        assert expected in study_command(path, "--no-report", cwd=tmp_path)
+    (tmp_path / "code_of_study.py").write_text(OWN + "# changed\n")
+    assert "2 of them computed" in study_command(path, "--no-report", cwd=tmp_path)
+
+
 def test_what_is_trained_is_not_trained_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -481,4 +492,4 @@ def test_damaged_notes_of_a_cell_say_what_to_do(tmp_path: Path) -> None:
 
 def test_the_columns_are_those_that_are_documented(tmp_path: Path) -> None:
     table = run(tmp_path).table()
-    assert list(table) == list(cells.COLUMNS)
+    assert list(table) == list(cell_rows.COLUMNS)
