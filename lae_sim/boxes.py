@@ -24,13 +24,23 @@ def iou(a: Floats, b: Floats) -> Floats:
     # columns of their own: arithmetic on rows of four is slow
     ax, ay, aw, ah = np.ascontiguousarray(a.T)
     bx, by, bw, bh = np.ascontiguousarray(b.T)
-    width = np.maximum(np.minimum(ax + aw, bx + bw) - np.maximum(ax, bx), 0.0)
-    height = np.maximum(np.minimum(ay + ah, by + bh) - np.maximum(ay, by), 0.0)
-    intersection = width * height
-    union = aw * ah + bw * bh - intersection
-    ratio = np.zeros(len(union))
-    np.divide(intersection, union, out=ratio, where=union > 0)
-    return np.clip(ratio, 0.0, 1.0)
+    intersection = _shared(ax, aw, bx, bw)
+    intersection *= _shared(ay, ah, by, bh)
+    union = aw * ah
+    union += bw * bh
+    union -= intersection
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio: Floats = np.divide(intersection, union, out=intersection)
+    ratio[~(union > 0)] = 0.0
+    return np.clip(ratio, 0.0, 1.0, out=ratio)
+
+
+def _shared(a: Floats, a_side: Floats, b: Floats, b_side: Floats) -> Floats:
+    """Length of what two intervals share, float64 [n]."""
+    length = a + a_side
+    np.minimum(length, b + b_side, out=length)
+    length -= np.maximum(a, b)
+    return np.maximum(length, 0.0, out=length)
 
 
 def centre(boxes: Floats) -> Floats:

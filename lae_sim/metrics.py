@@ -105,18 +105,18 @@ class FrameCounts:
     """What each answered frame adds to each metric's sum, before dividing.
 
     Attributes:
-        success: IoU thresholds passed, int64 [n].
-        precision: centre error thresholds passed, of 0..50 px, int64 [n].
+        success: IoU thresholds passed, whole numbers, float64 [n].
+        precision: centre error thresholds passed, of 0..50 px, whole numbers, float64 [n].
         norm_dp: whether the normalised error is <= 0.20, bool [n].
-        norm: normalised thresholds passed, int64 [n].
+        norm: normalised thresholds passed, whole numbers, float64 [n].
         apart: whether the truth counts for success and the answer does not overlap it at all, bool
             [n]: a failure, as VOT has it (Kristan et al., 2013).
     """
 
-    success: Ints
-    precision: Ints
+    success: Floats
+    precision: Floats
     norm_dp: Bools
-    norm: Ints
+    norm: Floats
     apart: Bools
 
     @property
@@ -143,27 +143,40 @@ def frame_counts(
     """
     if convention.first_frame_is_truth:
         answers = np.where((frames == 0)[:, None], truth, answers)
+    truth, answers = np.asfortranarray(truth), np.asfortranarray(answers)  # fast by columns
     valid = convention.valid_success(truth)
-    overlap = np.where(valid, iou(truth, answers), -1.0)
-    success = np.searchsorted(convention.iou_thresholds, overlap)  # thresholds t < IoU
+    overlap = iou(truth, answers)
+    overlap[~valid] = 0.0
 
-    x, y = np.ascontiguousarray((centre(answers) - centre(truth)).T)
+    x, y = (centre(answers) - centre(truth)).T
     valid_centre = convention.valid_precision(truth)
     invalid_error = np.inf if convention.leaves_out else -1.0
     error = np.where(valid_centre, _length(x, y), invalid_error)
-    w, h = np.ascontiguousarray(np.where(truth[:, 2:] > 0, truth[:, 2:], np.nan).T)
+    w, h = np.where(truth[:, 2:] > 0, truth[:, 2:], np.nan).T
     with np.errstate(over="ignore"):  # a truth of almost no size: an infinite error is a miss
         norm_error = np.where(valid_centre, _length(x / w, y / h), invalid_error)
-    norm_error = np.where(np.isnan(norm_error), np.inf, norm_error)
+    # fmin: an error of NaN passes no threshold
+    norm_error = np.fmin(np.maximum(norm_error, 0.0), 1.0)
     most = len(CENTRE_THRESHOLDS)
-    whole = np.ceil(np.fmin(np.maximum(error, 0), most))  # fmin: an error of NaN passes none
+    norm_most = len(NORM_THRESHOLDS)
     return FrameCounts(
-        success=success,
-        precision=most - whole.astype(np.int64),
+        success=_below(overlap, convention.thresholds - 1),
+        precision=most - np.ceil(np.fmin(np.maximum(error, 0.0), most)),
         norm_dp=norm_error <= NORM_DP,
-        norm=len(NORM_THRESHOLDS) - np.searchsorted(NORM_THRESHOLDS, norm_error),
-        apart=overlap == 0,
+        norm=norm_most - np.minimum(_below(norm_error, 100), norm_most),
+        apart=valid & (overlap == 0),
     )
+
+
+def _below(values: Floats, steps: int) -> Floats:
+    """How many of the thresholds 0, 1 / steps, 2 / steps, ... are below values in 0..1; exact.
+
+    ``floor(values * steps)`` errs by rounding, but only where the threshold of that number is
+    itself in doubt: all before it are below the value, and none after it is.
+    """
+    whole = np.floor(values * steps)
+    below: Floats = whole + (whole / steps < values)
+    return below
 
 
 def _all(flags: Bools) -> Bools:
@@ -175,8 +188,9 @@ def _all(flags: Bools) -> Bools:
 
 
 def _length(x: Floats, y: Floats) -> Floats:
-    length: Floats = np.sqrt(x**2 + y**2)
-    return length
+    length: Floats = np.square(x)
+    length += np.square(y)
+    return np.sqrt(length, out=length)
 
 
 def success_curve(truth: Floats, answers: Floats, convention: Convention) -> Floats:

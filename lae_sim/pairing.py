@@ -250,6 +250,11 @@ class Pairs:
     sigma_from: Ints
     sigma_to: Ints
 
+    def some(self, those: slice) -> Pairs:
+        """Some of them."""
+        columns = (self.item, self.frame, self.sigma_from, self.sigma_to)
+        return Pairs(*(column[those] for column in columns))
+
 
 def pairs(pairing: Pairing, fed: Histories) -> Pairs:
     """List the distinct pairs of frames and outputs, with the sigmas each is for."""

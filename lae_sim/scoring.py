@@ -1,7 +1,7 @@
 """Scoring answers: shares of frames and curves, for any number of permitted latencies at once.
 
 Each distinct pair of a world frame and an output is scored once, and its counts are added over the
-range of sigmas that it answers by difference arrays; counts are integers, so that no order of
+range of sigmas that it answers by difference arrays; counts are whole numbers, so that no order of
 summation changes a result.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -22,8 +23,11 @@ from lae_sim.metrics import (
     FrameCounts,
     frame_counts,
 )
-from lae_sim.pairing import Histories, Pairs
+from lae_sim.pairing import Histories, Pairs, ranges
 from lae_sim.run import Run
+
+_CHUNK = 1 << 14  # pairs at once: what is made of them stays in the cache
+_EXACT = 52  # bits of whole numbers that float64 holds, with one to spare
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +47,11 @@ class Scorer:
         self._convention = convention
         self._lengths = np.array([len(run.recording) for run in runs], np.int64)
         self._bases = np.cumsum(self._lengths) - self._lengths
-        self._truth = np.concatenate([run.recording.truth for run in runs])
-        self._boxes = np.concatenate([run.recording.boxes for run in runs])
+        self._truth = np.concatenate([run.recording.truth.T for run in runs], axis=1)
+        self._boxes = np.concatenate([run.recording.boxes.T for run in runs], axis=1)
         counted = self._lengths
         if convention.leaves_out:
-            valid = convention.valid_success(self._truth)
+            valid = convention.valid_success(self._truth.T)
             counted = np.add.reduceat(valid.astype(np.int64), self._bases)
         self._counted = np.where(counted > 0, counted, np.nan)
 
@@ -55,7 +59,7 @@ class Scorer:
         """Score paired answers for so many sigmas."""
         return self._scored(
             (
-                (fed.sequence[np.searchsorted(fed.offsets, found.item, "right") - 1], found, boxes)
+                (np.repeat(fed.sequence, np.diff(fed.offsets))[found.item], found, boxes)
                 for fed, found, boxes in parts
             ),
             count,
@@ -64,10 +68,10 @@ class Scorer:
     def offline(self) -> Scored:
         """Score every frame's own box; NaN for sequences that lack some."""
         sequence = np.repeat(np.arange(len(self._bases)), self._lengths)
-        frame = np.arange(len(self._truth)) - self._bases[sequence]
+        frame = np.arange(len(sequence)) - self._bases[sequence]
         none = np.zeros_like(frame)
-        scored = self._scored([(sequence, Pairs(frame, frame, none, none + 1), self._boxes)], 1)
-        missing = np.add.reduceat(np.isnan(self._boxes[:, 0]).astype(np.int64), self._bases) > 0
+        scored = self._scored([(sequence, Pairs(frame, frame, none, none + 1), self._boxes.T)], 1)
+        missing = np.add.reduceat(np.isnan(self._boxes[0]).astype(np.int64), self._bases) > 0
         for values in (*scored.scores.values(), scored.success, scored.precision):
             values[missing] = np.nan
         return scored
@@ -76,9 +80,12 @@ class Scorer:
         """Score answers, each part with the sequence of each pair, int64 [P]."""
         tally = _Tally(self._lengths, count, self._convention.thresholds)
         for sequence, found, boxes in parts:
-            truth = self._truth[self._bases[sequence] + found.frame]
-            counts = frame_counts(truth, boxes, found.frame, self._convention)
-            tally.add(sequence, found, counts)
+            for begin in range(0, len(boxes), _CHUNK):
+                now = slice(begin, begin + _CHUNK)
+                some = found.some(now)
+                truth = self._truth.take(self._bases[sequence[now]] + some.frame, axis=1).T
+                counts = frame_counts(truth, boxes[now], some.frame, self._convention)
+                tally.add(sequence[now], some, counts)
         thresholds = {"auc": self._convention.thresholds, "norm_auc": len(NORM_THRESHOLDS)}
         counted = self._counted[:, None]
         scores = {m: tally.sums[m] / (counted * thresholds.get(m, 1)) for m in METRICS}
@@ -104,39 +111,47 @@ class _Tally:
         self.precision = np.zeros((len(lengths), len(CENTRE_THRESHOLDS)))
 
     def add(self, sequence: Ints, found: Pairs, counts: FrameCounts) -> None:
-        """Add pairs, whose frames ascend in each sequence at each sigma."""
-        width = self._count + 1
-        begin, end = sequence * width + found.sigma_from, sequence * width + found.sigma_to
-        size = self._sequences * width
-        columns = {
-            "auc": counts.success,
-            "dp20": counts.dp,
-            "norm_dp20": counts.norm_dp,
-            "norm_auc": counts.norm,
-            "within50": counts.within50,
-        }
-        for name, values in columns.items():
+        """Add at most ``_CHUNK`` pairs, whose frames ascend in each sequence at each sigma."""
+        base, last = int(sequence[0]), int(sequence[-1])
+        here, width = slice(base, last + 1), self._count + 1
+        row = (sequence - base) * width
+        begin, end = row + found.sigma_from, row + found.sigma_to
+        size = (last + 1 - base) * width
+        kinds: tuple[dict[str, Any], ...] = (
+            {"auc": counts.success, "norm_auc": counts.norm},
+            {"dp20": counts.dp, "norm_dp20": counts.norm_dp, "within50": counts.within50},
+        )
+        for packed in kinds:
+            bits = _EXACT // len(packed)  # a chunk's sum of 101 thresholds takes 21, of flags 15
+            values = np.zeros(len(begin))
+            for k, each in enumerate(packed.values()):
+                values += each * 2.0 ** (k * bits)
             steps = np.bincount(begin, values, size) - np.bincount(end, values, size)
-            sums = steps.reshape(-1, width).cumsum(axis=1)[:, : self._count]
-            self.sums[name] += sums.astype(np.int64)
-        first = found.sigma_from == 0
-        of_first = sequence[first]
+            sums = steps.reshape(-1, width).cumsum(axis=1)[:, : self._count].astype(np.int64)
+            for name in packed:
+                self.sums[name][here] += sums & (1 << bits) - 1
+                sums >>= bits
+        first = np.flatnonzero(found.sigma_from == 0)
+        of_first = sequence[first] - base
         for curves, passed in (
             (self.success, counts.success),
             (self.precision[:, ::-1], counts.precision),
         ):
-            curves += _above(of_first, passed[first], *curves.shape)
+            part = curves[here]
+            part += _above(of_first, passed[first].astype(np.int64), *part.shape)
         self._note_failures(sequence, found, np.flatnonzero(counts.apart))
 
     def _note_failures(self, sequence: Ints, found: Pairs, lost: Ints) -> None:
         """Note the first pair of each sequence and sigma that is lost."""
-        sequence, frame = sequence[lost], found.frame[lost]
-        begin, end = found.sigma_from[lost], found.sigma_to[lost]
-        for m in range(self._count):
-            of_m = np.flatnonzero((begin <= m) & (m < end))
-            those = sequence[of_m]
-            first = np.flatnonzero(np.diff(those, prepend=-1))
-            self.failure[those[first], m] = frame[of_m[first]]
+        begin = sequence[lost] * self._count + found.sigma_from[lost]
+        sizes = found.sigma_to[lost] - found.sigma_from[lost]
+        # of losses in a row, in which one or two outputs answer each frame, the first will do
+        new = np.ones(len(lost), np.bool_)
+        for back in (1, 2):
+            new[back:] &= (begin[back:] != begin[:-back]) | (sizes[back:] != sizes[:-back])
+        begin, sizes, lost = begin[new], sizes[new], lost[new]
+        at = ranges(begin, sizes)
+        np.minimum.at(self.failure.reshape(-1), at, np.repeat(found.frame[lost], sizes))
 
 
 def _above(sequence: Ints, passed: Ints, sequences: int, most: int) -> Ints:

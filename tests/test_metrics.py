@@ -21,6 +21,7 @@ from lae_sim.metrics import (
     CONVENTIONS,
     METRICS,
     PYSOT,
+    _below,
     find_convention,
     frame_counts,
     precision_curve,
@@ -313,3 +314,24 @@ def test_an_unknown_convention_is_refused() -> None:
     assert find_convention("pysot") is PYSOT
     with pytest.raises(LaeError, match="no convention 'voc': there are pysot, elae, otb"):
         find_convention("voc")
+
+
+@pytest.mark.parametrize("steps", [20, 100])
+def test_thresholds_are_counted_exactly(steps: int) -> None:
+    """By arithmetic as by comparison with each, at every threshold and its neighbours too."""
+    thresholds = np.arange(steps + 1) / steps
+    near = [thresholds]
+    for towards in (-1.0, 2.0):
+        step = thresholds
+        for _ in range(3):
+            step = np.nextafter(step, towards)
+            near.append(step)
+    values = np.clip(np.concatenate([*near, np.random.default_rng(0).random(10_000)]), 0, 1)
+    counted = (thresholds < values[:, None]).sum(axis=1)
+    assert _below(values, steps).tolist() == counted.tolist()
+
+
+@given(st.floats(0, 1), st.sampled_from([20, 100]))
+def test_thresholds_below_a_value(value: float, steps: int) -> None:
+    below = _below(np.array([value]), steps)
+    assert below.tolist() == [sum(k / steps < value for k in range(steps + 1))]
