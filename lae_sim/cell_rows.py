@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lae_sim.arrow import from_numpy, from_texts
+from lae_sim.errors import LaeError
 from lae_sim.evaluation import Evaluation
 from lae_sim.metrics import METRICS
 
@@ -100,3 +102,19 @@ class CellRows:
         """The file's bytes."""
         self._writer.close()
         return self._file.getvalue()
+
+
+def read_rows(path: Path, columns: Sequence[str]) -> Any:
+    """Some columns of a cell's file, as one Arrow table of one chunk.
+
+    Raises:
+        LaeError: if the file is damaged; it says what to do.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            return file.read(columns).combine_chunks()
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise LaeError(f"{path}: damaged: delete it, and run the study again") from error

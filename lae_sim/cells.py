@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from fractions import Fraction
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from lae_sim import __version__
 from lae_sim.batch import batchable
 from lae_sim.cell_rows import CellRows
+from lae_sim.engine import Ints
 from lae_sim.evaluation import Evaluation, evaluate_groups
 from lae_sim.forecast import AnyFactory
 from lae_sim.latency import LatencySource, RandomSource, bootstrap, scaled
@@ -210,15 +211,18 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
             yield run
 
     curves, kept = _Curves(), []
+    departures = calls = 0
     for part in evaluate_groups(
         runs(), trace.metadata, chosen, setting.sigmas, convention, costs=costs, frames=GROUP
     ):
-        entries = len(part.sequences)
+        of_part = np.array(repetitions[: len(part.sequences)], np.int32)
+        del repetitions[: len(part.sequences)]
         for f, writer in enumerate(writers):
-            writer.add(part, f, np.array(repetitions[:entries], np.int32))
-        del repetitions[:entries]
+            writer.add(part, f, of_part)
         curves.add(part)
-        kept.append(_slim(part))
+        departures += int(part.departures.sum())
+        calls += int((part.processed - 1).sum())
+        kept.append(_without_scores(part, np.flatnonzero(of_part == setting.first)))
     about = Evaluation.joined(kept)
     results = []
     for f, (cell, writer) in enumerate(zip(cells, writers)):
@@ -227,25 +231,34 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
             "engine": replay.engine,
             "repetitions": setting.count,
             "curves": curves.means(f),
-            "approximate_outputs": int(about.departures.sum()),
-            "calls": int((about.processed - 1).sum()),
+            "approximate_outputs": departures,
+            "calls": calls,
             "notes": notes_on(about, trace.metadata, convention, only, at_arrival=False),
         }
         results.append(Result(cell.key, writer.finish(), details))
     return results
 
 
-def _slim(part: Evaluation) -> Evaluation:
-    """The part without its scores: what notes are about."""
-    none = np.zeros((1, len(part.sequences), 0))
-    return replace(
-        part,
+def _without_scores(part: Evaluation, kept: Ints) -> Evaluation:
+    """Some sequences of a part without their scores: what notes are about."""
+    none = np.zeros((1, len(kept), 0))
+    scored = ("scores", "failure", "success", "precision")
+    offline = ("offline", "offline_success", "offline_precision")
+    columns: dict[str, Any] = {
+        field.name: getattr(part, field.name)[kept]
+        for field in fields(part)
+        if field.name not in ("sequences", *scored, *offline)
+    }
+    return Evaluation(
+        sequences=tuple(part.sequences[s] for s in kept),
         scores=dict.fromkeys(METRICS, none),
         failure=none.astype(np.int64),
         success=none,
         precision=none,
+        offline={metric: values[kept] for metric, values in part.offline.items()},
         offline_success=none[0],
         offline_precision=none[0],
+        **columns,
     )
 
 

@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from lae_sim.arrow import from_numpy, to_numpy
 from lae_sim.boxes import Floats
+from lae_sim.cell_rows import COLUMNS, read_rows
 from lae_sim.cells import Cell, Setting
 from lae_sim.clock import Clock
 from lae_sim.execute import Store
@@ -40,8 +42,8 @@ class Scores:
         setting: the first of the settings, which differ in their repetitions.
         forecaster, convention: names.
         sequences: names, S of them.
-        means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``,
-            ``mismatch_max``, ``longest_hold`` (frames).
+        means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``;
+            of ``mismatch_max`` and ``longest_hold`` the largest (frames).
         repeated: ``auc``, ``dp20`` and ``failure_frame`` at the first sigma, float64 [R, S].
         over_sigmas: ``auc`` and ``dp20`` as plain means over sigma, float64 [R, S].
         once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms`` and the offline
@@ -74,7 +76,8 @@ class Scores:
         )
 
 
-_STALENESS = ("mismatch_mean", "mismatch_max", "longest_hold")
+_WORST = {"mismatch_max", "longest_hold"}
+_STALENESS = ("mismatch_mean", *sorted(_WORST))
 _REPEATED = ("auc", "dp20", "failure_frame")
 _ONCE = ("world_frames", "processed", "elapsed_ms", *(f"offline_{m}" for m in METRICS))
 
@@ -94,25 +97,19 @@ def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
 
 def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
     """The scores of cells that differ in their repetitions alone."""
-    import pyarrow.parquet as pq
-
-    from lae_sim.arrow import from_numpy, to_numpy
-
     first = cells[0]
     count = len(first.setting.sigmas)
     numbers = [*METRICS, *_STALENESS]
-    sums: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     repeated: dict[str, list[Floats]] = {name: [] for name in _REPEATED}
     over_sigmas: dict[str, list[Floats]] = {name: [] for name in ("auc", "dp20")}
     names: tuple[str, ...] = ()
     for cell in cells:
-        with pq.ParquetFile(store.rows(cell)) as file:
-            wanted = dict.fromkeys([*numbers, *_REPEATED, *_ONCE, "sequence", "repetition"])
-            rows = file.read(list(wanted)).combine_chunks()
+        wanted = dict.fromkeys([*numbers, *_REPEATED, *_ONCE, "sequence", "repetition"])
+        rows = read_rows(store.rows(cell), list(wanted))
 
         def column(name: str, rows: Any = rows) -> Floats:
-            chunk = rows.column(name).chunk(0)
-            return to_numpy(chunk, chunk.type.to_pandas_dtype()).astype(np.float64)
+            return to_numpy(rows.column(name).chunk(0), COLUMNS[name]).astype(np.float64)
 
         entries = rows.num_rows // count
         told = (
@@ -124,7 +121,6 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
             np.array([place[name] for name in told]), column("repetition")[::count],
         ))  # fmt: skip
         shape = (cell.setting.count, len(names), count)
-        assert entries == shape[0] * shape[1]
         for name in dict.fromkeys([*numbers, *_REPEATED, *_ONCE]):
             values = column(name).reshape(entries, count)[order].reshape(shape)
             if name in _REPEATED:
@@ -133,19 +129,22 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
                 over_sigmas[name].append(values.mean(axis=2))
             values = values[:, :, 0] if name in _ONCE else values
             # one after another from the first repetition on, however they were dealt out
-            before = [sums[name][None]] if name in sums else []
-            sums[name] = np.add.reduce(np.concatenate([*before, values]))
-    total = sum(cell.setting.count for cell in cells)
+            before = [found[name][None]] if name in found else []
+            combine = np.maximum if name in _WORST else np.add
+            found[name] = combine.reduce(np.concatenate([*before, values]))
+    count = sum(cell.setting.count for cell in cells)
+    for name in found.keys() - _WORST:
+        found[name] = found[name] / count
     return Scores(
         source=source,
         setting=first.setting,
         forecaster=first.forecaster,
         convention=first.convention,
         sequences=names,
-        means={name: sums[name] / total for name in numbers},
+        means={name: found[name] for name in numbers},
         repeated={name: np.concatenate(parts) for name, parts in repeated.items()},
         over_sigmas={name: np.concatenate(parts) for name, parts in over_sigmas.items()},
-        once={name: sums[name] / total for name in _ONCE},
+        once={name: found[name] for name in _ONCE},
         about=tuple(store.about(cell) for cell in cells),
     )
 
@@ -282,6 +281,7 @@ def _stale(scores: Scores, s: int, sigma: Fraction, clock: Clock, frames: Floats
     row = {
         "mismatch_mean": mean,
         "age_ms": (mean + float(sigma)) * frame_ms,
+        "age_max_ms": float(scores.means["mismatch_max"][:, s].max() + sigma) * frame_ms,
         "longest_stale_ms": float(scores.means["longest_hold"][:, s].max()) * frame_ms,
     }
     if s:

@@ -490,6 +490,16 @@ def test_damaged_notes_of_a_cell_say_what_to_do(tmp_path: Path) -> None:
         run(tmp_path)
 
 
+def test_a_damaged_cell_says_what_to_do(tmp_path: Path) -> None:
+    run(tmp_path)
+    path = next(iter((tmp_path / "results").glob("*.parquet")))
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(LaeError, match=f"{path.name}: damaged: delete it"):
+        run(tmp_path)
+    path.unlink()
+    assert run(tmp_path).computed == 1
+
+
 def test_the_columns_are_those_that_are_documented(tmp_path: Path) -> None:
     table = run(tmp_path).table()
     assert list(table) == list(cell_rows.COLUMNS)
