@@ -235,8 +235,9 @@ def lanes_of(runs: Sequence[Run], pairing: Pairing, fed: Histories, image_sizes:
         image_sizes: of each run, float64 [S, 2], infinite = unknown.
     """
     boxes = np.concatenate([run.boxes for run in runs])
-    frames = pairing.frames[fed.output]
-    return Lanes(fed.offsets, frames, boxes[fed.output], image_sizes[fed.sequence])
+    frames = pairing.frames.take(fed.output)
+    fed_boxes = boxes.take(fed.output, axis=0)
+    return Lanes(fed.offsets, frames, fed_boxes, image_sizes[fed.sequence])
 
 
 def _answers(

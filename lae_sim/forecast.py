@@ -158,7 +158,7 @@ class Hold:
     @staticmethod
     def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
         """The same for many lanes at once."""
-        boxes: Floats = lanes.boxes[item]
+        boxes: Floats = lanes.boxes.take(item, axis=0)
         return boxes
 
 

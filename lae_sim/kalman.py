@@ -22,6 +22,7 @@ from lae_sim.forecast import ImageSize, Lanes
 
 RESTART_IOU = 0.3
 LEAST_AREA = 75
+_CHUNK = 1 << 14  # forecasts at once: what is made of them stays in the cache
 
 Number = TypeVar("Number", float, Floats)
 Covariance = tuple[Number, Number, Number]
@@ -69,9 +70,15 @@ class TunedKalman:
         self, lanes: Lanes, item: Ints, frame: Ints, restart_iou: float | None = None
     ) -> Floats:
         """The same for many lanes at once; restarts as in :func:`filter_lanes`."""
-        position, velocity = filter_lanes(lanes, item, self, restart_iou)
-        reach = self.reach((frame - lanes.frames[item]).astype(np.float64))
-        return self.boxes((position + reach * velocity).T)
+        states, place = _filtered(lanes, self, restart_iou)
+        forecasts = np.empty((4, len(item)))
+        for begin in range(0, len(item), _CHUNK):
+            now = slice(begin, begin + _CHUNK)
+            position, velocity = states.take(place.take(item[now]), axis=2)
+            ahead = frame[now] - lanes.frames.take(item[now])
+            velocity *= self.reach(ahead.astype(np.float64))
+            np.add(position, velocity, out=forecasts[:, now])
+        return self.boxes(forecasts.T)
 
     def reach(self, interval: Number) -> Number:
         """How many frames' velocity an interval of so many frames is worth."""
@@ -241,10 +248,7 @@ def filter_lanes(
     settings: TunedKalman = PAPER,
     restart_iou: float | None = None,
 ) -> tuple[Floats, Floats]:
-    """Filter all lanes in step: the k-th update of every lane that has one, for each k.
-
-    Lanes are sorted by length, so that those still running are always the first ones, and items by
-    their place in the lane, so that each step works on one stretch of memory.
+    """Filter all lanes.
 
     Args:
         lanes: what the filters are fed.
@@ -255,38 +259,78 @@ def filter_lanes(
     Returns:
         Position and velocity of the state after each of these items, float64 [4, P] each.
     """
+    states, place = _filtered(lanes, settings, restart_iou)
+    position, velocity = states.take(place.take(item), axis=2)
+    return position, velocity
+
+
+def _filtered(
+    lanes: Lanes, settings: TunedKalman, restart_iou: float | None
+) -> tuple[Floats, Ints]:
+    """Filter all lanes in step: the k-th update of every lane that has one, for each k.
+
+    Lanes are sorted by length, so that those still running are always the first ones, and items by
+    their place in the lane, so that each step works on one stretch of memory.
+
+    The arithmetic is that of :meth:`TunedKalman.gain`, in place: the fewer arrays are touched, the
+    faster.
+
+    Returns:
+        States after all items, position and velocity, float64 [2, 4, N], and where each item has
+        its own, int64 [N].
+    """
     lengths = np.diff(lanes.offsets)
     longest = np.argsort(-lengths, kind="stable")
     running = np.searchsorted(-lengths[longest], -np.arange(lengths.max()))  # with more than k
-    place = np.repeat(np.arange(lengths.max()), running)  # k, for each item in the new order
     ends = np.cumsum(running)
     lane = np.arange(ends[-1]) - np.repeat(ends - running, running)
-    order = lanes.offsets[:-1][longest][lane] + place
-    interval = np.zeros(len(order))
-    later = order[running[0] :]
-    interval[running[0] :] = lanes.frames[later] - lanes.frames[later - 1]
+    order = lanes.offsets[longest].take(lane)
+    order += np.repeat(np.arange(lengths.max()), running)
+    interval = np.diff(lanes.frames, prepend=0).astype(np.float64)
+    interval[lanes.offsets[:-1]] = 0.0
+    interval = interval.take(order)
     keep, reach, noise = (np.asarray(each, np.float64) for each in settings.transition(interval))
-    measured = np.ascontiguousarray(settings.states(lanes.boxes)[order].T)
-    positions, velocities = measured.copy(), np.zeros_like(measured)
-    start = (settings.p0, 0.0, settings.p0)
-    covariance = tuple(np.full(running[0], value, np.float64) for value in start)
-    position, velocity = positions[:, : running[0]], velocities[:, : running[0]]
+    measured = np.ascontiguousarray(settings.states(lanes.boxes).take(order, axis=0).T)
+    states = np.empty((2, *measured.shape))
+    width = int(running[0])
+    state = np.zeros((2, 4, width))
+    state[0] = measured[:, :width]
+    states[:, :, :width] = state
+    start = np.array([[settings.p0], [0.0], [settings.p0]])
+    covariance = np.repeat(start, width, axis=1)
     for n, end in zip(running[1:].tolist(), ends[1:].tolist()):
         now = slice(end - n, end)
-        kept, reached = keep[now], reach[now]
-        a, b, c = (each[:n] for each in covariance)
-        covariance, gain, velocity_gain = settings.gain((a, b, c), kept, reached, noise[now])
-        predicted = position[:, :n] + reached * velocity[:, :n]
-        error = measured[:, now] - predicted
-        position = np.add(predicted, gain * error, out=positions[:, now])
-        faster = kept * velocity[:, :n]
-        velocity = np.add(faster, velocity_gain * error, out=velocities[:, now])
+        if n < width:
+            width, state, covariance = n, state[:, :, :n].copy(), covariance[:, :n].copy()
+        (position, velocity), (a, b, c) = state, covariance
+        kept, reached, noisy = keep[now], reach[now], noise[now]
+        term = 2.0 * reached
+        term *= b
+        a += term
+        np.multiply(reached, reached, out=term)
+        term *= c
+        a += term
+        a += noisy
+        np.multiply(reached, c, out=term)
+        b += term
+        if settings.decay != 1:
+            b *= kept
+            c *= kept * kept
+        c += noisy
+        gains = covariance[:2] / np.add(a, settings.r, out=term)
+        c -= np.multiply(gains[1], b, out=term)
+        covariance[:2] -= gains[0] * covariance[:2]
+        position += reached * velocity
+        if settings.decay != 1:
+            velocity *= kept
+        measured_now = measured[:, now]
         if restart_iou is not None:
-            lost = np.flatnonzero(iou(predicted.T, measured[:, now].T) < restart_iou)
-            position[:, lost], velocity[:, lost] = measured[:, now][:, lost], 0.0
-            for each, value in zip(covariance, start):
-                each[lost] = value
-    where = np.empty_like(order)
-    where[order] = np.arange(len(order))
-    asked = where[item]
-    return positions[:, asked], velocities[:, asked]
+            lost = np.flatnonzero(iou(position.T, measured_now.T) < restart_iou)
+        state += gains[:, None] * (measured_now - position)
+        if restart_iou is not None:
+            position[:, lost], velocity[:, lost] = measured_now[:, lost], 0.0
+            covariance[:, lost] = start
+        states[:, :, now] = state
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return states, place
