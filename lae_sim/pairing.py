@@ -12,10 +12,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import lcm
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lae_sim.boxes import Bools
 from lae_sim.clock import MAX_INT64
 from lae_sim.engine import Ints, Schedule
 from lae_sim.errors import LaeError
@@ -185,26 +187,34 @@ class Histories:
     output: Ints
 
     def parts(self, items: int) -> Iterator[Histories]:
-        """The same in parts of whole sequences, of at most so many items if one has no more."""
-        begins = np.flatnonzero(np.diff(self.sequence, prepend=-1))
-        sizes = np.diff(self.offsets[np.append(begins, len(self.sequence))])
-        first = total = 0
-        for begin, size in zip(begins.tolist(), sizes.tolist()):
-            if total and total + size > items:
-                yield self._part(first, begin)
-                first, total = begin, 0
-            total += size
-        yield self._part(first, len(self.sequence))
+        """The same in parts of whole sequences, of at most so many items if one has no more.
 
-    def _part(self, first: int, end: int) -> Histories:
-        those = slice(first, end)
-        offsets = self.offsets[first : end + 1]
+        Sequences of similar size go together, and ascend in each part.
+        """
+        sequences, lanes = np.unique(self.sequence, return_counts=True)
+        lane_sizes = np.diff(self.offsets)
+        sizes = np.bincount(self.sequence, lane_sizes)[sequences].astype(np.int64)
+        largest = np.argsort(-sizes // lanes, kind="stable")
+        part: list[int] = []
+        total = 0
+        for s, size in zip(largest.tolist(), sizes[largest].tolist()):
+            if part and total + size > items:
+                yield self._part(np.isin(self.sequence, sequences[part]))
+                part, total = [], 0
+            part.append(s)
+            total += size
+        yield self._part(np.isin(self.sequence, sequences[part]))
+
+    def _part(self, those: Bools) -> Histories:
+        if those.all():
+            return self
+        sizes = np.diff(self.offsets)
         return Histories(
             self.sequence[those],
             self.sigma_from[those],
             self.sigma_to[those],
-            offsets - offsets[0],
-            self.output[offsets[0] : offsets[-1]],
+            np.concatenate([[0], np.cumsum(sizes[those])]),
+            self.output[np.repeat(those, sizes)],
         )
 
 
@@ -250,7 +260,7 @@ class Pairs:
     sigma_from: Ints
     sigma_to: Ints
 
-    def some(self, those: slice) -> Pairs:
+    def some(self, those: Any) -> Pairs:
         """Some of them."""
         columns = (self.item, self.frame, self.sigma_from, self.sigma_to)
         return Pairs(*(column[those] for column in columns))
@@ -258,19 +268,29 @@ class Pairs:
 
 def pairs(pairing: Pairing, fed: Histories) -> Pairs:
     """List the distinct pairs of frames and outputs, with the sigmas each is for."""
-    history = np.repeat(np.arange(len(fed.sequence)), np.diff(fed.offsets))
-    low, high = fed.sigma_from[history], fed.sigma_to[history]
-    begin = pairing.first[fed.output, high - 1].astype(np.int64)
-    sizes = np.maximum(pairing.end[fed.output, low] - begin, 0)
-    item = np.repeat(np.arange(len(history)), sizes)
+    sizes = np.diff(fed.offsets)
+    low, high = np.repeat(fed.sigma_from, sizes), np.repeat(fed.sigma_to, sizes)
+    count = len(pairing.sigmas)
+    cell = fed.output * count
+    begin = pairing.first.take(cell + high - 1).astype(np.int64)
+    sizes = np.maximum(pairing.end.take(cell + low) - begin, 0)
+    item = np.repeat(np.arange(len(low)), sizes)
     frame = ranges(begin, sizes)
-    output = fed.output[item]
-    query = pairing.scale * frame
-    visible = _place(pairing.sigmas, pairing.steps[output] - query)
-    hidden = _place(pairing.sigmas, pairing.next_steps[output] - query)
-    sigma_from, sigma_to = np.maximum(visible, low[item]), np.minimum(hidden, high[item])
-    some = sigma_from < sigma_to
-    return Pairs(item[some], frame[some], sigma_from[some], sigma_to[some])
+    found = Pairs(item, frame, low.take(item), high.take(item))
+    # a history of one sigma has no other pairs
+    several = np.flatnonzero(found.sigma_to - found.sigma_from > 1)
+    if not len(several):
+        return found
+    output = fed.output.take(item.take(several))
+    query = pairing.scale * frame.take(several)
+    for ends, steps, limit in (
+        (found.sigma_from, pairing.steps, np.maximum),
+        (found.sigma_to, pairing.next_steps, np.minimum),
+    ):
+        seen = _place(pairing.sigmas, steps.take(output) - query)
+        ends[several] = limit(seen, ends.take(several))
+    some = found.sigma_from < found.sigma_to
+    return found if some.all() else found.some(some)
 
 
 def _place(sigmas: Ints, values: Ints) -> Ints:

@@ -59,7 +59,7 @@ class Scorer:
         """Score paired answers for so many sigmas."""
         return self._scored(
             (
-                (np.repeat(fed.sequence, np.diff(fed.offsets))[found.item], found, boxes)
+                (np.repeat(fed.sequence, np.diff(fed.offsets)).take(found.item), found, boxes)
                 for fed, found, boxes in parts
             ),
             count,
@@ -112,11 +112,12 @@ class _Tally:
 
     def add(self, sequence: Ints, found: Pairs, counts: FrameCounts) -> None:
         """Add at most ``_CHUNK`` pairs, whose frames ascend in each sequence at each sigma."""
-        base, last = int(sequence[0]), int(sequence[-1])
-        here, width = slice(base, last + 1), self._count + 1
-        row = (sequence - base) * width
-        begin, end = row + found.sigma_from, row + found.sigma_to
-        size = (last + 1 - base) * width
+        here = sequence[np.diff(sequence, prepend=-1) != 0]  # each once: they ascend
+        rank = np.zeros(here[-1] + 1, np.int64)
+        rank[here] = np.arange(len(here))
+        local, width = rank.take(sequence), self._count + 1
+        begin, end = local * width + found.sigma_from, local * width + found.sigma_to
+        size = len(here) * width
         kinds: tuple[dict[str, Any], ...] = (
             {"auc": counts.success, "norm_auc": counts.norm},
             {"dp20": counts.dp, "norm_dp20": counts.norm_dp, "within50": counts.within50},
@@ -132,13 +133,13 @@ class _Tally:
                 self.sums[name][here] += sums & (1 << bits) - 1
                 sums >>= bits
         first = np.flatnonzero(found.sigma_from == 0)
-        of_first = sequence[first] - base
+        of_first = local.take(first)
         for curves, passed in (
             (self.success, counts.success),
             (self.precision[:, ::-1], counts.precision),
         ):
-            part = curves[here]
-            part += _above(of_first, passed[first].astype(np.int64), *part.shape)
+            shape = len(here), curves.shape[1]
+            curves[here] += _above(of_first, passed.take(first).astype(np.int64), *shape)
         self._note_failures(sequence, found, np.flatnonzero(counts.apart))
 
     def _note_failures(self, sequence: Ints, found: Pairs, lost: Ints) -> None:
