@@ -74,7 +74,8 @@ class TunedKalman:
         forecasts = np.empty((4, len(item)))
         for begin in range(0, len(item), _CHUNK):
             now = slice(begin, begin + _CHUNK)
-            position, velocity = states.take(place.take(item[now]), axis=2)
+            found = states.take(place.take(item[now]), axis=0)
+            position, velocity = np.ascontiguousarray(found.transpose(1, 2, 0))
             ahead = frame[now] - lanes.frames.take(item[now])
             velocity *= self.reach(ahead.astype(np.float64))
             np.add(position, velocity, out=forecasts[:, now])
@@ -260,7 +261,7 @@ def filter_lanes(
         Position and velocity of the state after each of these items, float64 [4, P] each.
     """
     states, place = _filtered(lanes, settings, restart_iou)
-    position, velocity = states.take(place.take(item), axis=2)
+    position, velocity = states.take(place.take(item), axis=0).transpose(1, 2, 0)
     return position, velocity
 
 
@@ -291,11 +292,11 @@ def _filtered(
     interval = interval.take(order)
     keep, reach, noise = (np.asarray(each, np.float64) for each in settings.transition(interval))
     measured = np.ascontiguousarray(settings.states(lanes.boxes).take(order, axis=0).T)
-    states = np.empty((2, *measured.shape))
+    states = np.empty((len(order), 2, 4))
     width = int(running[0])
     state = np.zeros((2, 4, width))
     state[0] = measured[:, :width]
-    states[:, :, :width] = state
+    states[:width] = state.transpose(2, 0, 1)
     start = np.array([[settings.p0], [0.0], [settings.p0]])
     covariance = np.repeat(start, width, axis=1)
     for n, end in zip(running[1:].tolist(), ends[1:].tolist()):
@@ -330,7 +331,7 @@ def _filtered(
         if restart_iou is not None:
             position[:, lost], velocity[:, lost] = measured_now[:, lost], 0.0
             covariance[:, lost] = start
-        states[:, :, now] = state
+        states[now] = state.transpose(2, 0, 1)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     return states, place

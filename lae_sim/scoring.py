@@ -47,8 +47,8 @@ class Scorer:
         self._convention = convention
         self._lengths = np.array([len(run.recording) for run in runs], np.int64)
         self._bases = np.cumsum(self._lengths) - self._lengths
-        self._truth = np.concatenate([run.recording.truth.T for run in runs], axis=1)
-        self._boxes = np.concatenate([run.recording.boxes.T for run in runs], axis=1)
+        self._truth = _columns([run.recording.truth for run in runs])
+        self._boxes = _columns([run.recording.boxes for run in runs])
         counted = self._lengths
         if convention.leaves_out:
             valid = convention.valid_success(self._truth.T)
@@ -153,6 +153,11 @@ class _Tally:
         begin, sizes, lost = begin[new], sizes[new], lost[new]
         at = ranges(begin, sizes)
         np.minimum.at(self.failure.reshape(-1), at, np.repeat(found.frame[lost], sizes))
+
+
+def _columns(boxes: Sequence[Floats]) -> Floats:
+    """The columns of boxes one after another, float64 [4, n], each in one piece."""
+    return np.ascontiguousarray(np.concatenate(boxes).T)
 
 
 def _above(sequence: Ints, passed: Ints, sequences: int, most: int) -> Ints:
