@@ -11,10 +11,11 @@ import numpy as np
 from lae_sim.boxes import Floats
 from lae_sim.engine import Ints
 from lae_sim.errors import LaeError, explained
-from lae_sim.forecast import AnyFactory, Lanes, factory_for, forecast, own
+from lae_sim.forecast import AnyFactory, Lanes, SequenceFactory, forecast, own
 from lae_sim.metadata import Metadata
 from lae_sim.metrics import METRICS, PYSOT, Convention
 from lae_sim.pairing import Histories, Pairing, Pairs, histories, pair, pairs
+from lae_sim.recording import Recording
 from lae_sim.run import Run
 from lae_sim.scoring import Scorer
 from lae_sim.trace import BATCH_ROWS, batched
@@ -137,10 +138,40 @@ def evaluate_groups(
     """
     if not forecasters:
         raise LaeError("name at least one forecaster, such as hold")
+    alone: dict[Recording, _Alone] = {}
     for group in batched(runs, frames):
+        alone = _alone([run.recording for run in group], convention, alone)
         yield _evaluate_group(
-            group, metadata, forecasters, sigmas, convention, at_arrival, costs or {}
+            group, metadata, forecasters, sigmas, convention, at_arrival, costs or {}, alone
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Alone:
+    """What scores have of a recording alone, however it is replayed."""
+
+    truthless: int
+    missing: int
+    offline: Sequence[float]
+    success: Floats
+    precision: Floats
+
+
+def _alone(
+    recordings: Iterable[Recording], convention: Convention, known: Mapping[Recording, _Alone]
+) -> dict[Recording, _Alone]:
+    """Those of some recordings; those of the group before may be the same, replayed again."""
+    found = {recording: known.get(recording) for recording in recordings}
+    new = [recording for recording, value in found.items() if value is None]
+    if new:
+        offline = Scorer(new, convention).offline()
+        scores = np.stack([offline.scores[metric][:, 0] for metric in METRICS], axis=1).tolist()
+        for r, recording in enumerate(new):
+            truth, boxes = recording.truth[:, 0], recording.boxes[:, 0]
+            missing = int(np.isnan(truth).sum()), int(np.isnan(boxes).sum())
+            curves = offline.success[r], offline.precision[r]
+            found[recording] = _Alone(*missing, scores[r], *curves)
+    return {recording: value for recording, value in found.items() if value is not None}
 
 
 def _evaluate_group(
@@ -151,32 +182,34 @@ def _evaluate_group(
     convention: Convention,
     at_arrival: bool,
     costs: Mapping[str, int],
+    alone: Mapping[Recording, _Alone],
 ) -> Evaluation:
     """Score some runs at once."""
     schedules = [run.schedule for run in runs]
     needed = {0, *(costs.get(name, 0) for name in forecasters)}
     pairings = {cost: pair(schedules, sigmas, at_arrival, cost) for cost in needed}
     pairing = pairings[0]
-    scorer = Scorer(runs, convention)
+    scorer = Scorer([run.recording for run in runs], convention)
     scored = [
         scorer.of(
             _answers(runs, metadata, pairings[costs.get(name, 0)], name, factory), len(sigmas)
         )
         for name, factory in forecasters.items()
     ]
-    offline = scorer.offline()
-    calls = [run.schedule.elapsed_ns[1:] for run in runs]
+    fixed = [alone[run.recording] for run in runs]
+    offline = np.array([each.offline for each in fixed])
+    elapsed = [run.schedule.elapsed_ns for run in runs]
     return Evaluation(
         sequences=tuple(run.recording.name for run in runs),
         frames=pairing.lengths,
-        truthless=np.array([np.isnan(run.recording.truth[:, 0]).sum() for run in runs], np.int64),
-        missing=np.array([np.isnan(run.recording.boxes[:, 0]).sum() for run in runs], np.int64),
+        truthless=np.array([each.truthless for each in fixed], np.int64),
+        missing=np.array([each.missing for each in fixed], np.int64),
         processed=np.diff(pairing.offsets),
         departures=np.array([run.departures for run in runs], np.int64),
         disagreement=np.array([run.disagreement for run in runs]),
-        init_ns=np.array([run.schedule.elapsed_ns[0] for run in runs], np.int64),
-        calls_ns=np.array([elapsed.sum() for elapsed in calls], np.int64),
-        calls_hz=np.array([_rates(elapsed).sum() for elapsed in calls]),
+        init_ns=np.array([each[0] for each in elapsed], np.int64),
+        calls_ns=np.array([each[1:].sum() for each in elapsed], np.int64),
+        calls_hz=np.array([_rates(each[1:]).sum() for each in elapsed]),
         mismatch_sum=pairing.mismatch_sum,
         mismatch_max=pairing.mismatch_max,
         longest_hold=pairing.longest_hold,
@@ -184,9 +217,9 @@ def _evaluate_group(
         failure=np.stack([each.failure for each in scored]),
         success=np.stack([each.success for each in scored]),
         precision=np.stack([each.precision for each in scored]),
-        offline={metric: share[:, 0] for metric, share in offline.scores.items()},
-        offline_success=offline.success,
-        offline_precision=offline.precision,
+        offline=dict(zip(METRICS, offline.T)),
+        offline_success=np.stack([each.success for each in fixed]),
+        offline_precision=np.stack([each.precision for each in fixed]),
     )
 
 
@@ -259,7 +292,11 @@ def _answers(
     sizes = [metadata.image_size(run.recording.name) or (np.inf, np.inf) for run in runs]
     image_sizes = np.array(sizes, np.float64)
     with explained(name):
-        factories = [factory_for(factory, run.recording) for run in runs]
+        factories = (
+            [factory.for_sequence(run.recording) for run in runs]
+            if isinstance(factory, SequenceFactory)
+            else [factory] * len(runs)
+        )
     for fed in histories(pairing, memoryless=own(factory, "memoryless")).parts(_PART):
         found = pairs(pairing, fed)
         lanes = lanes_of(runs, pairing, fed, image_sizes)

@@ -24,7 +24,7 @@ from lae_sim.metrics import (
     frame_counts,
 )
 from lae_sim.pairing import Histories, Pairs, ranges
-from lae_sim.run import Run
+from lae_sim.recording import Recording
 
 _CHUNK = 1 << 14  # pairs at once: what is made of them stays in the cache
 _EXACT = 52  # bits of whole numbers that float64 holds, with one to spare
@@ -41,14 +41,14 @@ class Scored:
 
 
 class Scorer:
-    """Scores answers of some runs against their truth."""
+    """Scores answers for some recordings against their truth."""
 
-    def __init__(self, runs: Sequence[Run], convention: Convention) -> None:
+    def __init__(self, recordings: Sequence[Recording], convention: Convention) -> None:
         self._convention = convention
-        self._lengths = np.array([len(run.recording) for run in runs], np.int64)
+        self._lengths = np.array([len(recording) for recording in recordings], np.int64)
         self._bases = np.cumsum(self._lengths) - self._lengths
-        self._truth = _columns([run.recording.truth for run in runs])
-        self._boxes = _columns([run.recording.boxes for run in runs])
+        self._truth = _columns([recording.truth for recording in recordings])
+        self._boxes = _columns([recording.boxes for recording in recordings])
         counted = self._lengths
         if convention.leaves_out:
             valid = convention.valid_success(self._truth.T)
