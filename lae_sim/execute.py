@@ -191,7 +191,7 @@ def cluster_executor(address: str) -> Iterator[tuple[Executor, Callable[[], int]
             "--scheduler needs Dask: pip install 'lae-sim[distributed]', here and on the workers"
         ) from error
     try:
-        client = Client(address, timeout=10, set_as_default=False)
+        client = Client(address, timeout=5, set_as_default=False)
     except (OSError, ValueError) as error:
         raise LaeError(f"no Dask scheduler at {address}: {error}") from error
     with client:

@@ -100,7 +100,7 @@ def test_scores_agree_with_plain_loops_over_the_oracle(
 
 
 @given(groups(), SIGMAS, st.sampled_from(list(CONVENTIONS)))
-@settings(max_examples=45)
+@settings(max_examples=20)
 def test_curves_and_failures_agree_with_those_of_single_sequences(
     group: tuple[Fraction, list[Recording]], sigmas: list[Fraction], name: str
 ) -> None:
