@@ -56,6 +56,7 @@ def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("nasty")
     study = Study(
         tuple(nasty_traces(folder)),
+        fps=(None, Fraction(15)),
         scales=(Fraction(1), Fraction(2)),
         latencies=("constant:20ms", "constant:47ms"),
         sigmas=(Fraction(0), Fraction(1, 2)),
