@@ -1,7 +1,7 @@
 """Arrow arrays from and to NumPy through their buffers.
 
-``pa.array(ndarray)`` and ``Array.to_numpy()`` import pandas where it is installed, which costs more
-than reading a trace; these do not.
+``pa.array(ndarray)`` and ``Array.to_numpy()`` import pandas where it is installed, and ``cast`` and
+``take`` import ``pyarrow.compute``, which costs more than reading a trace; these do not.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ def from_texts(texts: Sequence[str], times: int = 1) -> Any:
     import pyarrow as pa
 
     encoded = [text.encode() for text in texts]
-    ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
-    buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(encoded))]
-    once = pa.Array.from_buffers(pa.string(), len(texts), buffers)
-    codes = from_numpy(np.repeat(np.arange(len(texts), dtype=np.int32), times))
-    return once if times == 1 else pa.DictionaryArray.from_arrays(codes, once).cast(pa.string())
+    sizes = np.repeat(np.array([len(text) for text in encoded], np.int32), times)
+    ends = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+    joined = b"".join(text * times for text in encoded)
+    buffers = [None, pa.py_buffer(ends), pa.py_buffer(joined)]
+    return pa.Array.from_buffers(pa.string(), len(sizes), buffers)
 
 
 def to_numpy(array: Any, dtype: npt.DTypeLike) -> npt.NDArray[Any]:

@@ -11,14 +11,16 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from operator import index, itemgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import simpy
 
 from lae_sim.clock import Clock
 from lae_sim.errors import LaeError
+
+if TYPE_CHECKING:
+    import simpy
 
 Ints = npt.NDArray[np.int64]
 
@@ -74,6 +76,8 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
             instant does not fit in 64-bit ticks.
         TypeError: if a time is not an integer, such as seconds as a float.
     """
+    import simpy
+
     if length < 1:
         raise LaeError("a sequence needs at least one frame")
     calls: list[Call] = []

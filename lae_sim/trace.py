@@ -184,7 +184,8 @@ class _StoredRecordings:
             groups = (file.metadata.row_group(g) for g in range(file.num_row_groups))
             if sum(group.num_rows for group in groups) != file.metadata.num_rows:
                 raise TraceError(f"{self.path}: the file is damaged: its row counts disagree")
-            batches = file.iter_batches(BATCH_ROWS, columns=present, use_threads=False)
+            # twice, since row groups end with the sequence that fills them
+            batches = file.iter_batches(2 * BATCH_ROWS, columns=present, use_threads=False)
             for batch in batches:
                 if batch.num_rows:
                     yield Rows.of_batch(batch)
