@@ -124,7 +124,7 @@ class RowChecker:
 
     def _check_nulls(self, rows: Rows) -> None:
         for columns, null in ((TRUTH, rows.truth_null), (BOX, rows.box_null)):
-            partly = np.flatnonzero(null.any(axis=1) != null.all(axis=1))
+            partly = np.flatnonzero((null[:, 1:] != null[:, :1]).any(axis=1)) if null.any() else ()
             if len(partly):
                 row = int(partly[0])
                 column = columns[int(np.argmax(null[row]))]
