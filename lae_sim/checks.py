@@ -124,14 +124,14 @@ class RowChecker:
 
     def _check_nulls(self, rows: Rows) -> None:
         for columns, null in ((TRUTH, rows.truth_null), (BOX, rows.box_null)):
-            partly = np.flatnonzero((null[:, 1:] != null[:, :1]).any(axis=1)) if null.any() else ()
-            if len(partly):
-                row = int(partly[0])
+            differ = null[:, 1:] != null[:, :1]
+            if differ.any():
+                row = int(np.argmax(differ.any(axis=1)))
                 column = columns[int(np.argmax(null[row]))]
                 self._fail(rows, row, column, f"null, but not all of {', '.join(columns)} are")
-        differ = np.flatnonzero(rows.elapsed_null != rows.box_null[:, 0])
-        if len(differ):
-            row = int(differ[0])
+        unlike = np.flatnonzero(rows.elapsed_null != rows.box_null[:, 0])
+        if len(unlike):
+            row = int(unlike[0])
             if rows.elapsed_null[row]:
                 self._fail(rows, row, "elapsed_ns", "null, but the frame has a box")
             self._fail(rows, row, "x", "null, but the frame has a time; a lost target needs a box")
