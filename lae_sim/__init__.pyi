@@ -1,7 +1,7 @@
 from .batch import simulate_lanes
 from .boxes import iou
 from .clock import Clock, parse_duration, parse_fps, parse_rational
-from .comparison import World, compare
+from .comparison import World, compare_forecasters
 from .datasets import find_dataset
 from .device import describe_device
 from .drawing import draw_frame, film_strip
@@ -87,7 +87,7 @@ __all__ = [
     "by_attribute",
     "by_call",
     "by_frame",
-    "compare",
+    "compare_forecasters",
     "comparison_table",
     "constant",
     "describe_device",

@@ -18,6 +18,7 @@ import numpy as np
 from lae_sim import __version__
 from lae_sim.batch import batchable
 from lae_sim.cell_rows import CellRows
+from lae_sim.costs import cost_notes
 from lae_sim.engine import Ints
 from lae_sim.evaluation import Evaluation, evaluate_groups
 from lae_sim.forecast import AnyFactory
@@ -233,7 +234,10 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
             "curves": curves.means(f),
             "approximate_outputs": departures,
             "calls": calls,
-            "notes": notes_on(about, trace.metadata, convention, only, at_arrival=False),
+            "notes": [
+                *notes_on(about, trace.metadata, convention, only, at_arrival=False),
+                *cost_notes({cell.forecaster: cell.cost_ns} if cell.cost_ns else {}),
+            ],
         }
         results.append(Result(cell.key, writer.finish(), details))
     return results

@@ -148,7 +148,7 @@ def _table(
     """Compare, with a progress bar if the standard error stream is a terminal."""
     from tqdm import tqdm
 
-    from lae_sim.comparison import compare, parse_world, steps
+    from lae_sim.comparison import compare_forecasters, parse_world, steps
     from lae_sim.metrics import find_convention
     from lae_sim.pairing import SIGMA_GRID
 
@@ -161,7 +161,7 @@ def _table(
             bar.set_description(what, refresh=False)
             bar.update()
 
-        return compare(
+        return compare_forecasters(
             traces,
             forecasters,
             world,

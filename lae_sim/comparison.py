@@ -74,7 +74,7 @@ def parse_world(arguments: argparse.Namespace) -> World:
     )
 
 
-def compare(
+def compare_forecasters(
     traces: Mapping[str, Trace],
     forecasters: Mapping[str, AnyFactory | Trainer],
     world: World = RECORDED,
@@ -142,7 +142,7 @@ def fitted(
     seed: int = 0,
     progress: Callable[[str], object] = lambda what: None,
 ) -> tuple[dict[str, AnyFactory], list[str]]:
-    """Train those forecasters that must be trained, across folds; see :func:`compare`.
+    """Train those forecasters that must be trained, across folds; see :func:`compare_forecasters`.
 
     Returns:
         A factory for each forecaster, and what to say of the training.
@@ -177,7 +177,7 @@ def steps(
     world: World,
     folds: int,
 ) -> int:
-    """How often :func:`compare` calls ``progress``, if there are at least ``folds`` videos."""
+    """How often ``progress`` is called by it, if there are at least ``folds`` videos."""
     trained = sum(isinstance(each, Trainer) for each in forecasters.values())
     return trained * folds + len(traces) * len(world.latencies) * len(world.scales)
 

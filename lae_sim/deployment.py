@@ -20,6 +20,8 @@ STEP = Fraction(1, 100)
 MOST = 1 << 13
 """Scales are looked for in hundredths, up to 81.92 times slower."""
 
+_RELATIVE = ("latest", "fifo", "every")  # policies that know no absolute times
+
 HELD = 1_000_000
 """World frames of a trace that is kept in memory for a search; a larger one is read each time."""
 
@@ -112,11 +114,13 @@ def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
 def requirement(search: Search, found: Mapping[str, Any]) -> dict[str, Any]:
     """The answer as a row.
 
-    A schedule depends on processing times in frames alone, so times scaled by f are a world of f
-    times the rate (but for the rounding to whole ns).
+    Where no time is absolute, as a cost or an expected time of a policy is, a schedule depends on
+    processing times in frames alone: times scaled by f are a world that moves f times as fast, with
+    the recorded motion from frame to frame (but for the rounding to whole ns).
     """
     setting = search.cell.setting
     scale = None if found["scale"] is None else Fraction(found["scale"])
+    relative = search.cell.cost_ns == 0 and setting.policy.split(":")[0] in _RELATIVE
     return {
         "trace": setting.trace.label,
         "times_from": (setting.timing or setting.trace).label,
@@ -129,5 +133,5 @@ def requirement(search: Search, found: Mapping[str, Any]) -> dict[str, Any]:
         "required_auc": float(search.required),
         **found,
         "speed_up": None if not scale else float(1 / scale),
-        "fps_at_most": None if scale is None else float(scale * setting.fps),
+        "fps_at_most": float(scale * setting.fps) if scale is not None and relative else None,
     }

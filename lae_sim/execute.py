@@ -150,7 +150,10 @@ def run_all(
             for future in done:
                 yield running.pop(future), future.result()
     except BrokenExecutor as error:
-        raise LaeError(f"a worker died, perhaps for want of memory: {_GOES_ON}") from error
+        raise LaeError(
+            "a worker died, for want of memory or, in a script, of 'if __name__ == \"__main__\":': "
+            + _GOES_ON
+        ) from error
     except (LaeError, OSError):
         raise
     except Exception as error:  # whatever a cluster has to say: a worker lost too often, an import

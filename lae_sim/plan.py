@@ -106,6 +106,13 @@ def make_plan(study: Study, base: Path | None = None) -> Plan:
         found = Input(path, label.removesuffix(".parquet"), digest(path))
         sources[path] = Source(found, trace.metadata, trace.frames or 0)
     traces, timing = [sources[path] for path in own], [sources[path] for path in timed]
+    for other in timing:
+        if not any(_same_runs(source, other) for source in traces):
+            metadata = other.metadata
+            raise LaeError(
+                f"timing: {other.input.path} is of {metadata.tracker} on {metadata.dataset}: none "
+                "of the traces is of the same tracker and dataset on another device"
+            )
     names = dict.fromkeys(["hold", *study.forecasters])
     forecasters = {name: load_any(name) for name in names}
     training = _training(study, traces)

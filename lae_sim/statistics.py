@@ -3,7 +3,7 @@
 Sequences are the independent observations; frames are not. Everything is computed in groups, one
 per trace, latency, scale, sigma and metric. All forecasters of a group are measured on the same
 sequences, and share the bootstrap's resamples, so that their differences are paired. The tidy table
-that goes in is described at :func:`lae_sim.comparison.compare`.
+that goes in is described at :func:`lae_sim.comparison.compare_forecasters`.
 """
 
 from __future__ import annotations

@@ -25,7 +25,8 @@ examples:
   lae-sim study study.toml --scheduler tcp://head:8786    on a Dask cluster
   lae-sim study study.toml --json | jq '.summary[] | [.trace, .forecaster, .auc]'
 
-a study file (TOML); only traces is required, and every list is crossed with the others:
+a study file (TOML); only traces is required, and all worlds, latencies, scales, forecasters and
+conventions are crossed:
   traces = ["traces/*.parquet"]   files, folders, globs, URLs (s3://...: pip install fsspec s3fs)
   timing = ["jetson.parquet"]     other devices' times, for traces of their tracker and dataset
   forecasters = ["hold", "kalman"]       as in compare
@@ -40,6 +41,7 @@ a study file (TOML); only traces is required, and every list is crossed with the
   costs = ["kalman=2ms"]                 what forecasting costs
   sequences = ["car1"]                   these only
   attributes = true                      in the report
+  folds = 5                              of the training of forecasters that must be trained
   require_auc = 0.5                      look for the slowest device on which each tracker has it
 """
 
@@ -49,7 +51,11 @@ def parser() -> argparse.ArgumentParser:
     made = new_parser(PROGRAM, "Replay and score traces in every way that a study names.", EXAMPLES)
     add = made.add_argument
     add("study", metavar="STUDY.toml", help="what to compute")
-    add("--out", metavar="FOLDER", help="where results go (default: STUDY-results); what is there")
+    add(
+        "--out",
+        metavar="FOLDER",
+        help="where results go, and are looked for (default: STUDY-results)",
+    )
     add("--workers", type=argument(lambda text: whole(text, 1)), help="processes (default: cores)")
     add("--scheduler", metavar="ADDRESS", help="a Dask cluster to compute on, tcp://host:8786")
     add("--no-report", action="store_true", help="write no report.html and no tables")
@@ -62,6 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     failed: list[bool] = []
     status = exit_status(lambda: failed.append(_study(arguments)), PROGRAM)
+    if status == 130:
+        print("what is finished is kept: the same command goes on from there", file=sys.stderr)
     return status or int(any(failed))
 
 

@@ -23,9 +23,9 @@ def compare_traces(
         ``difference`` of the mean AUC with its interval; ``p`` of Wilcoxon's signed-rank test over
         the sequences, and ``p_holm``, corrected for the number of pairs of its group (Holm, "A
         Simple Sequentially Rejective Multiple Test Procedure", 1979); ``better_here``, how probable
-        it is that one run of A beats one of B on these sequences (0 or 1 without jitter, 1/2 for a
-        tie), and ``better``, the same on other sequences like these (bootstrap, a repetition drawn
-        for each sequence).
+        it is that one run of A beats one of B on these sequences (a tie counts half; None without
+        jitter), and ``better``, the same on other sequences like these (bootstrap, a repetition
+        drawn for each sequence).
     """
     together: dict[tuple[str, ...], list[Scores]] = {}
     for each in scores:
@@ -64,7 +64,8 @@ def _pair(
     difference = ours.mean(axis=0) - theirs.mean(axis=0)
     margins = np.einsum("s,rs->r", difference, drawn)
     low, high = ends(margins)
-    if len(ours) > 1 or len(theirs) > 1:
+    jitter = len(ours) > 1 or len(theirs) > 1
+    if jitter:
         margins = _drawn_margins(ours, theirs, drawn, seed)
     here = np.sign(np.round(ours.mean(axis=1)[:, None] - theirs.mean(axis=1), 12))
     setting = a.setting
@@ -84,7 +85,7 @@ def _pair(
         "difference_low": low,
         "difference_high": high,
         "p": signed_rank_p(np.round(difference, 12)),
-        "better_here": float((here.mean() + 1) / 2),
+        "better_here": float((here.mean() + 1) / 2) if jitter else None,
         "better": float((np.sign(np.round(margins, 12)).mean() + 1) / 2),
     }
 

@@ -194,7 +194,7 @@ def _facts(results: StudyResults) -> str:
         )
     repeated = max(row["repetitions"] for row in rows)
     facts = {
-        "traces": f"{len(results.traces)}, of {len({row['tracker'] for row in rows})} trackers",
+        "traces": f"{len(results.traces)}; trackers: {len({row['tracker'] for row in rows})}",
         "forecasters": ", ".join(dict.fromkeys(row["forecaster"] for row in rows)),
         "cells": f"{len(results.plan.cells):,}, {len(results.failures):,} pieces failed",
         "repetitions": f"{repeated:,} of random latencies" if repeated > 1 else "1",
@@ -202,7 +202,12 @@ def _facts(results: StudyResults) -> str:
         "uncertainty": f"[ ]: 95 % percentile bootstrap over sequences, seed {study.seed}",
         "made with": f"lae_sim {__version__}",
     }
-    return _pairs(facts)
+    made_up = [
+        f"{source.input.label}: {source.metadata.timing_note}"
+        for source in results.plan.sources
+        if source.metadata.timing_note
+    ]
+    return _pairs({**facts, **({"times": "; ".join(made_up)} if made_up else {})})
 
 
 def _sections(view: View) -> Iterator[Section]:

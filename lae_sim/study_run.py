@@ -68,9 +68,21 @@ class StudyResults:
     def notes(self) -> list[str]:
         """What keeps the figures from being what their names promise, each once."""
         told = [note for scores in self.scores for about in scores.about for note in about["notes"]]
-        of_traces = [f"{trace['trace']}: {text}" for trace in self.traces
-                     for text in trace["warnings"]]  # fmt: skip
-        return list(dict.fromkeys([*self.training, *told, *of_traces]))
+        sources = [(source.input.label, source.metadata) for source in self.plan.sources]
+        times = [f"{label}: times: {about.timing_note}" for label, about in sources
+                 if about.timing_note]  # fmt: skip
+        warnings = [f"{trace['trace']}: {text}" for trace in self.traces
+                    for text in trace["warnings"]]  # fmt: skip
+        uneven = [f"{dataset}: its traces do not have the same sequences: compare no means"
+                  for dataset in self._uneven()]  # fmt: skip
+        return list(dict.fromkeys([*uneven, *times, *self.training, *told, *warnings]))
+
+    def _uneven(self) -> list[str]:
+        """Datasets of which some traces have other sequences than others."""
+        found: dict[str, set[tuple[str, ...]]] = {}
+        for scores in self.scores:
+            found.setdefault(scores.source.metadata.dataset, set()).add(scores.sequences)
+        return [dataset for dataset, sequences in found.items() if len(sequences) > 1]
 
     def document(self) -> dict[str, Any]:
         """All but the scores of single sequences, as ``study.json`` holds it."""

@@ -165,12 +165,16 @@ def summarise_study(
     """
     hold = {(*_identity(s),): s for s in scores if s.forecaster == "hold"}
     weights: dict[int, Floats] = {}
-    rows = []
+    rows: list[Row] = []
+    rivals: dict[tuple[Any, ...], list[Row]] = {}
     for each in scores:
-        base = hold.get(_identity(each))
-        ours = [*_rows(each, base, seed, resamples, weights)]
+        ours = [*_rows(each, hold.get(_identity(each)), seed, resamples, weights)]
+        for row in ours:
+            rival = (*each.group, each.sequences, each.forecaster, row["sigma"])
+            rivals.setdefault(rival, []).append(row)
         rows += ours
-    _mark_front(rows)
+    for group in rivals.values():
+        _mark_front(group)
     return rows
 
 
@@ -307,25 +311,19 @@ def _median_survival(times: Floats, failed: Any, frame_ms: float) -> float | Non
     return None
 
 
-def _mark_front(rows: Sequence[Row]) -> None:
-    """Mark the Pareto front of each setting: no other is both faster and better.
+def _mark_front(group: Sequence[Row]) -> None:
+    """Mark the Pareto front of rivals: no other has a higher AUC and faster calls.
 
-    Compared are the traces of one dataset, world, latency, convention, forecaster and sigma, by the
-    mean time of a call and the AUC.
+    Rivals are the traces with the same sequences, world, latency, convention, forecaster and sigma.
     """
-    together: dict[tuple[Any, ...], list[Row]] = {}
-    keys = ("dataset", "policy", "fps", "latency", "scale", "convention", "forecaster", "sigma")
-    for row in rows:
-        together.setdefault(tuple(row[key] for key in keys), []).append(row)
-    for group in together.values():
-        for row in group:
-            row["pareto"] = row["auc"] is not None and not any(
-                other["auc"] >= row["auc"]
-                and other["elapsed_ms"] <= row["elapsed_ms"]
-                and (other["auc"], other["elapsed_ms"]) != (row["auc"], row["elapsed_ms"])
-                for other in group
-                if other["auc"] is not None
-            )
+    for row in group:
+        row["pareto"] = row["auc"] is not None and not any(
+            other["auc"] >= row["auc"]
+            and other["elapsed_ms"] <= row["elapsed_ms"]
+            and (other["auc"], other["elapsed_ms"]) != (row["auc"], row["elapsed_ms"])
+            for other in group
+            if other["auc"] is not None
+        )
 
 
 def ends(samples: Floats) -> tuple[float, float]:

@@ -82,6 +82,7 @@ def _label(row: Row) -> Entry:
 
 _RECOVERED = _number("recovered_auc", ".1f", 100, "%", ".0f")
 _RANKING: dict[str, tuple[_Cell, str]] = {
+    "n": (_number("sequences", ".0f"), "number of sequences"),
     "AUC": (_number("auc"), "with its 95 % interval over sequences"),
     "jitter": (_jitter, "the range of 95 % of the repetitions' AUC"),
     "offline": (_number("offline_auc"), "AUC without latency"),
@@ -100,7 +101,7 @@ _RANKING: dict[str, tuple[_Cell, str]] = {
     "to failure s": (_number("time_to_failure_ms", ".1f", 1e-3), "median time to the first such "
                      "answer (Kaplan and Meier); unknown if less than half fail"),
     "front": (lambda row: Entry("★" if row["pareto"] else "", int(row["pareto"])),
-              "no other trace is both faster and better"),
+              "with the same forecaster, no other trace is both faster and better"),
     "replay": (_label, "the share of outputs that follow another frame than when recorded"),
     "engine": (_name("engine"), "batch, or simpy where policy or latency need it"),
 }  # fmt: skip
@@ -133,6 +134,7 @@ def ranking(view: View) -> Table:
         tuple(tuple(cell(row) for cell in cells) for row in named),
         len(header),
         paper=(paper, [i for i, row in enumerate(rows) if view.stands(row)]),
+        paper_caption=f"The best AUC first: {told_setting(view.standing)}",
     )
 
 
@@ -221,13 +223,14 @@ def comparison_table(view: View) -> Table:
     keys += ["forecaster", "a", "b"]
     named = [{**row, "a": view.names[row["a"]], "b": view.names[row["b"]]} for row in rows]
     cells = [
-        *map(_name, keys), _number("difference", "+.3f"), _p("p"), _p("p_holm"),
+        *map(_name, keys), _number("sequences", ".0f"), _number("difference", "+.3f"), _p("p"),
+        _p("p_holm"),
         _number("better_here", ".2f"), _number("better", ".2f"),
     ]  # fmt: skip
     return Table(
         "comparisons",
         f"Trackers against each other{told}",
-        (*keys, "AUC of a - b", "p", "p (Holm)", "a better here", "a better"),
+        (*keys, "n", "AUC of a - b", "p", "p (Holm)", "a better here", "a better"),
         tuple(tuple(cell(row) for cell in cells) for row in named),
         len(keys),
     )
@@ -249,7 +252,8 @@ def required_table(view: View) -> Table:
     header = ("AUC asked", "without latency", "times at most x", "AUC there", "speed-up needed")
     return Table(
         "required",
-        "How slow a device may be, and how fast the world, for the required AUC",
+        "How slow a device may be, and how fast the world may move (with the recorded motion from "
+        f"frame to frame), for the required AUC at sigma {rows[0]['sigma']}",
         (*keys, *header, "world fps at most"),
         tuple(tuple(cell(row) for cell in cells) for row in rows),
         len(keys),

@@ -66,6 +66,7 @@ def ranking(rows: Sequence[Row]) -> str:
         *differ,
         "trace",
         "forecaster",
+        "n",
         "AUC",
         "offline",
         "recovered",
@@ -81,7 +82,7 @@ def ranking(rows: Sequence[Row]) -> str:
         rows, key=lambda row: (order[tuple(row[name] for name in differ)], -(row["auc"] or 0))
     ):
         line = [*(row[name] for name in differ), row["trace"], row["forecaster"]]
-        line += [interval(row, "auc"), number(row["offline_auc"])]
+        line += [str(row["sequences"]), interval(row, "auc"), number(row["offline_auc"])]
         line += [percent(row.get("recovered_auc")), signed(row.get("vs_hold_auc"))]
         p = row.get("vs_hold_auc_p")
         line += ["-" if p is None else p_label(p), number(row["dp20"])]
@@ -97,7 +98,8 @@ def ranking(rows: Sequence[Row]) -> str:
             told,
             table(header, lines, len(differ) + 2),
             "[ ]: 95 % bootstrap over sequences; jitter: 95 % of the repetitions; p: Wilcoxon's "
-            "signed-rank test;\nfront: no other trace is both faster and better",
+            "signed-rank test;\nn: sequences; front: with this forecaster no other trace is both "
+            "faster and better" + "; age at the first sigma" * (sigma == MEAN),
         ]
     )
 
@@ -112,6 +114,7 @@ def comparisons(rows: Sequence[Row]) -> str:
         "forecaster",
         "a",
         "b",
+        "n",
         "AUC of a - b",
         "p",
         "p (Holm)",
@@ -120,8 +123,13 @@ def comparisons(rows: Sequence[Row]) -> str:
     ]
     lines = [
         [*(row[name] for name in differ), row["forecaster"], row["a"], row["b"]]
-        + [interval(row, "difference", "+.3f"), p_label(row["p"]), p_label(row["p_holm"])]
-        + [f"{row['better_here']:.2f}", f"{row['better']:.2f}"]
+        + [
+            str(row["sequences"]),
+            interval(row, "difference", "+.3f"),
+            p_label(row["p"]),
+            p_label(row["p_holm"]),
+        ]
+        + [number(row["better_here"], ".2f"), number(row["better"], ".2f")]
         for row in rows
     ]
     return table(header, lines, len(differ) + 3) + (
@@ -132,17 +140,23 @@ def comparisons(rows: Sequence[Row]) -> str:
 
 def requirements(rows: Sequence[Row]) -> str:
     """A line per trace, setting and forecaster: how slow it may be."""
-    header = ["trace", "times from", "latency", "forecaster", "AUC asked", "without latency"]
+    differ = [name for name in ("policy", "fps", "convention") if len({r[name] for r in rows}) > 1]
+    header = ["trace", "times from", "latency", *differ, "forecaster", "AUC asked"]
+    header += ["without latency"]
     header += ["times at most", "AUC there", "speed-up needed", "world fps at most"]
     lines = [
-        [row["trace"], row["times_from"], row["latency"], row["forecaster"]]
+        [row["trace"], row["times_from"], row["latency"], *(row[name] for name in differ)]
+        + [row["forecaster"]]
         + [number(row["required_auc"]), number(row["auc_without_latency"])]
         + ["-" if row["scale"] is None else f"x {float(eval_scale(row['scale'])):g}"]
         + [number(row["auc"]), number(row["speed_up"], ".2f"), number(row["fps_at_most"], ".1f")]
         for row in rows
     ]
-    told = f"\ntimes at most: by bisection, in steps of 0.01; sigma {rows[0]['sigma']}"
-    return table(header, lines, 4) + told
+    return table(header, lines, 4 + len(differ)) + (
+        f"\ntimes at most: by bisection, in steps of 0.01; all at sigma {rows[0]['sigma']}; world "
+        "fps at most: how fast the\nworld may move, with the recorded motion from frame to frame "
+        "(unknown where a cost or a policy has a time of its own)"
+    )
 
 
 def eval_scale(text: str) -> float:

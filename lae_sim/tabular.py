@@ -39,6 +39,7 @@ class Table:
         left: so many first columns hold names.
         groups: titles above the other columns, each with the number of its columns.
         paper: places of the columns, and of the rows, that fit in a paper; all if None.
+        paper_caption: what these show, if it is less.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Table:
     left: int
     groups: tuple[tuple[str, int], ...] = ()
     paper: tuple[Sequence[int], Sequence[int]] | None = None
+    paper_caption: str = ""
 
 
 def printable(text: object) -> str:
@@ -60,7 +62,10 @@ def write_csv(table: Table, path: Path) -> None:
     above = [title for title, count in table.groups for _ in range(count)]
     titles = [
         f"{above[c - table.left]} {title}" if above and c >= table.left else title
-        for c, title in enumerate(table.header)
+        for c, title in enumerate(
+            f"{before} {title}" if title == "Δ" else title
+            for before, title in zip(("", *table.header), table.header)
+        )
     ]
     wide = [any(row[c].ends for row in table.rows) for c in range(len(titles))]
     header: list[str] = []
@@ -81,8 +86,9 @@ def latex(table: Table) -> str:
     columns, lines = table.paper or (range(len(table.header)), range(len(table.rows)))
     left = sum(c < table.left for c in columns)
     text = [
-        rf"% {table.caption}",
-        r"% \usepackage{booktabs}",
+        rf"% {printable(table.paper_caption or table.caption)}",
+        r"% \usepackage{booktabs}; if it is too wide: \usepackage{adjustbox} and",
+        rf"% \adjustbox{{max width=\linewidth}}{{\input{{{table.name}}}}}",
         rf"\begin{{tabular}}{{@{{}}{'l' * left}{'r' * (len(columns) - left)}@{{}}}}",
         r"\toprule",
     ]

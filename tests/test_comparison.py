@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lae_sim.comparison import World, compare, steps
+from lae_sim.comparison import World, compare_forecasters, steps
 from lae_sim.errors import LaeError
 from lae_sim.evaluation import evaluate
 from lae_sim.examples import Examples, assign_folds
@@ -52,7 +52,7 @@ def values(table: pd.DataFrame, **wanted: Any) -> np.ndarray:
 
 
 def test_columns_and_rows(slow: Trace) -> None:
-    table = compare({"slow": slow}, FORECASTERS)
+    table = compare_forecasters({"slow": slow}, FORECASTERS)
     assert list(table) == [*KEYS, "value"]
     assert not table.duplicated(KEYS).any()
     assert len(table) == 4 * 4 * 3  # metrics, forecasters with hold and offline, sequences
@@ -70,7 +70,7 @@ def test_every_value_is_what_evaluate_gives(slow: Trace, fast: Trace) -> None:
     fps, convention = Fraction(25), find_convention("otb")
     world = World(sources, scales, fps, fifo)
     traces = {"slow": slow, "fast": fast}
-    table = compare(traces, FORECASTERS, world, sigmas, convention)
+    table = compare_forecasters(traces, FORECASTERS, world, sigmas, convention)
     keys = ["trace", "latency", "scale", "metric", "forecaster", "sigma"]
     got = table.groupby(keys)["value"].agg(list).to_dict()
     expected = {}
@@ -92,8 +92,8 @@ def test_every_value_is_what_evaluate_gives(slow: Trace, fast: Trace) -> None:
 def test_the_order_of_the_traces_does_not_change_a_value(slow: Trace, fast: Trace) -> None:
     trainer = KalmanTrainer(q=(0.3, 3.0), decay=(0.95, 1.0), state=("corner",))
     forecasters = {**FORECASTERS, "tuned": trainer}
-    one = compare({"slow": slow, "fast": fast}, forecasters, folds=3)
-    other = compare({"fast": fast, "slow": slow}, forecasters, folds=3)
+    one = compare_forecasters({"slow": slow, "fast": fast}, forecasters, folds=3)
+    other = compare_forecasters({"fast": fast, "slow": slow}, forecasters, folds=3)
     assert one["trace"].iloc[0] == "slow" != other["trace"].iloc[0]
     one, other = (table.sort_values(KEYS, ignore_index=True) for table in (one, other))
     pd.testing.assert_frame_equal(one, other, check_exact=True)
@@ -118,7 +118,7 @@ def test_nothing_is_trained_on_what_it_is_scored_on(slow: Trace, fast: Trace) ->
     told: list[str] = []
     world = World({"recorded": by_frame}, [Fraction(1), Fraction(2)])
     arguments = ({"slow": slow, "fast": fast}, {"spy": spy, **FORECASTERS}, world)
-    table = compare(*arguments, folds=3, seed=7, progress=told.append)
+    table = compare_forecasters(*arguments, folds=3, seed=7, progress=told.append)
     folds = assign_folds(SEQUENCES, 3, 7)
     everything = set(SEQUENCES)
     assert spy.shown == [
@@ -136,7 +136,7 @@ def test_nothing_is_trained_on_what_it_is_scored_on(slow: Trace, fast: Trace) ->
 
 def test_notes_say_what_is_approximate(slow: Trace) -> None:
     world = World({"constant:1ms": constant(1_000_000), "constant:90ms": constant(90_000_000)})
-    notes = compare({"slow": slow}, {}, world).attrs["notes"]
+    notes = compare_forecasters({"slow": slow}, {}, world).attrs["notes"]
     assert notes == [
         "slow, constant:90ms: approximate, 100% of the outputs follow another frame than when "
         "recorded"
@@ -145,21 +145,23 @@ def test_notes_say_what_is_approximate(slow: Trace) -> None:
 
 def test_a_real_time_trace_is_exact_and_has_no_offline_scores() -> None:
     trace = read_trace(TRACES / "synthetic-slow-realtime.parquet", SEQUENCES)
-    table = compare({"run": trace}, FORECASTERS)
+    table = compare_forecasters({"run": trace}, FORECASTERS)
     assert np.isnan(values(table, forecaster="offline")).all()
     assert np.isfinite(table["value"][table["forecaster"] != "offline"]).all()
     assert not [note for note in table.attrs["notes"] if "approximate" in note]
     every_frame = read_trace(TRACES / "synthetic-slow.parquet", SEQUENCES)
-    again = compare({"run": every_frame}, FORECASTERS)
+    again = compare_forecasters({"run": every_frame}, FORECASTERS)
     known = table["forecaster"] != "offline"
     pd.testing.assert_frame_equal(table[known], again[known], check_exact=True)
     with pytest.raises(LaeError, match="the trace has no box for it"):
-        compare({"run": trace}, FORECASTERS, World({"constant:1ms": constant(1_000_000)}))
+        compare_forecasters(
+            {"run": trace}, FORECASTERS, World({"constant:1ms": constant(1_000_000)})
+        )
 
 
 def test_costs_delay_the_answers(slow: Trace) -> None:
-    free = compare({"slow": slow}, FORECASTERS)
-    table = compare({"slow": slow}, FORECASTERS, costs=["kalman=40ms"])
+    free = compare_forecasters({"slow": slow}, FORECASTERS)
+    table = compare_forecasters({"slow": slow}, FORECASTERS, costs=["kalman=40ms"])
     costs = {"kalman": 40_000_000}
     runs = list(replay_trace(slow))
     found = evaluate(runs, slow.metadata, {"kalman": Kalman}, costs=costs)
@@ -171,23 +173,23 @@ def test_costs_delay_the_answers(slow: Trace) -> None:
         np.testing.assert_array_equal(got, expected)
     assert [note for note in table.attrs["notes"] if "kalman 40000 us" in note]
     with pytest.raises(LaeError, match="no forecaster 'nobody'"):
-        compare({"slow": slow}, FORECASTERS, costs=["nobody=1ms"])
+        compare_forecasters({"slow": slow}, FORECASTERS, costs=["nobody=1ms"])
 
 
 def test_forecasters_that_must_know_their_sequence(slow: Trace) -> None:
-    table = compare({"slow": slow}, {"oracle": Oracle})
+    table = compare_forecasters({"slow": slow}, {"oracle": Oracle})
     got = values(table, forecaster="oracle", metric="auc")
     np.testing.assert_allclose(got, 20 / 21, rtol=0, atol=1e-12)
 
 
 def test_what_cannot_be_compared(slow: Trace) -> None:
     with pytest.raises(LaeError, match="nothing to compare"):
-        compare({}, FORECASTERS)
+        compare_forecasters({}, FORECASTERS)
     with pytest.raises(LaeError, match="offline is the name of the tracker's own scores"):
-        compare({"slow": slow}, {"offline": Kalman})
+        compare_forecasters({"slow": slow}, {"offline": Kalman})
     alone = read_trace(TRACES / "synthetic-slow.parquet", SEQUENCES[:1])
     with pytest.raises(LaeError, match="only one video"):
-        compare({"slow": alone}, {"tuned-kalman": load_any("tuned-kalman")})
+        compare_forecasters({"slow": alone}, {"tuned-kalman": load_any("tuned-kalman")})
 
 
 def test_a_sequence_without_truth_has_no_value_where_the_convention_leaves_it_out() -> None:
@@ -198,7 +200,7 @@ def test_a_sequence_without_truth_has_no_value_where_the_convention_leaves_it_ou
         Recording.new("good", boxes, boxes, np.full(9, 10**7)),
     ]
     trace = Trace(Metadata.new("30", "every-frame"), recordings)
-    table = compare({"a": trace}, FORECASTERS, convention=find_convention("exclude"))
+    table = compare_forecasters({"a": trace}, FORECASTERS, convention=find_convention("exclude"))
     assert np.isnan(values(table, sequence="bare")).all()
     assert np.isfinite(values(table, sequence="good")).all()
     assert [note for note in table.attrs["notes"] if "no ground truth" in note]
@@ -229,7 +231,7 @@ def test_nanotrack_on_dtb70(
                 yield Recording.new(sequence, truth, boxes[sequence], times)
 
     trace = Trace(Metadata.new("30", "every-frame"), list(recordings()))
-    table = compare({"nano": trace}, {name: load_any(name)}, World(LATENCIES))
+    table = compare_forecasters({"nano": trace}, {name: load_any(name)}, World(LATENCIES))
     summary = summarise(table, metrics=["auc"], resamples=10)
     ours = summary[summary["forecaster"] == name]
     assert list(ours["latency"]) == list(LATENCIES)

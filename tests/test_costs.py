@@ -10,7 +10,7 @@ import pytest
 from witness import moving
 
 from lae_sim.clock import Clock
-from lae_sim.comparison import compare
+from lae_sim.comparison import compare_forecasters
 from lae_sim.costs import cost_notes, measure_cost, resolve_costs
 from lae_sim.errors import LaeError
 from lae_sim.evaluation import answers, evaluate
@@ -117,7 +117,7 @@ def test_an_answer_that_costs_a_frame_is_the_answer_for_the_frame_before_told_la
 def test_a_comparison_counts_and_tells_costs() -> None:
     traces = {"t": Trace(EVERY, RECORDINGS)}
     factories = {"kalman": Kalman}
-    free, paid = (compare(traces, factories, costs=costs) for costs in ((), ("20ms",)))
+    free, paid = (compare_forecasters(traces, factories, costs=costs) for costs in ((), ("20ms",)))
     changed = (free["value"] != paid["value"]) & free["value"].notna()
     assert set(free["forecaster"][changed]) == {"kalman"}
     assert any("kalman 20000 us" in note for note in paid.attrs["notes"])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from witness import moving, psi, schedule_latest, worlds
 
 from lae_sim.clock import Clock
-from lae_sim.comparison import World, compare
+from lae_sim.comparison import World, compare_forecasters
 from lae_sim.errors import LaeError
 from lae_sim.evaluation import evaluate
 from lae_sim.examples import CrossFitted, Examples, assign_folds, cross_fitted, video_of
@@ -233,7 +233,7 @@ def test_no_comparison_scores_what_it_has_trained_on(folds: int) -> None:
     traces = {"one": Trace(metadata, RECORDINGS[:6]), "two": Trace(metadata, RECORDINGS[2:])}
     world = World({"recorded": by_frame, "slow": constant(95_000_000)}, [Fraction(1), Fraction(2)])
     trainers = {"fake": FakeTrainer(), "other": FakeTrainer()}
-    table = compare(traces, trainers, world, folds=folds, seed=folds)
+    table = compare_forecasters(traces, trainers, world, folds=folds, seed=folds)
     for trainer in trainers.values():
         assert_honest(trainer, min(folds, 6))
         assert len(trainer.scored) == 4 * (6 + 7)
@@ -256,7 +256,7 @@ def test_the_two_traces_are_no_way_around_it() -> None:
         for name, kept in {"one": ("car1_1", "dog"), "two": ("car1_2", "van")}.items()
     }
     trainer = FakeTrainer()
-    compare(traces, {"fake": trainer}, folds=3)
+    compare_forecasters(traces, {"fake": trainer}, folds=3)
     assert_honest(trainer, 3, ["car1_1", "car1_2", "dog", "van"])
 
 

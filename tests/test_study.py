@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import pytest
 
 import lae_sim
 from lae_sim import cell_rows
-from lae_sim.comparison import compare
+from lae_sim.comparison import compare_forecasters
 from lae_sim.errors import LaeError
 from lae_sim.latency import bootstrap, scaled
 from lae_sim.pairing import SIGMA_GRID
@@ -212,7 +213,7 @@ def test_jitter_has_its_own_interval_and_probability(tmp_path: Path) -> None:
             for name in (pair["a"], pair["b"])
         )  # fmt: skip
         wins = (a[:, None] > b).mean() + (a[:, None] == b).mean() / 2
-        assert pair["better_here"] == pytest.approx(wins)
+        assert pair["better_here"] == (None if len(a) == 1 else pytest.approx(wins))
         assert pair["difference"] == pytest.approx(a.mean() - b.mean())
 
 
@@ -254,10 +255,29 @@ def test_what_a_required_auc_asks_for_is_true(tmp_path: Path) -> None:
     assert Fraction(found["beyond"]) - Fraction(found["scale"]) == Fraction(1, 100)
     assert found["speed_up"] == pytest.approx(1 / Fraction(found["scale"]))
     assert found["fps_at_most"] == pytest.approx(30 * Fraction(found["scale"]))
+    paid = replace(study, costs=("hold=1ms",))  # whose time is not one in frames
+    assert run(tmp_path / "paid", paid).required[0]["fps_at_most"] is None
     study = Study((str(SLOW),), forecasters=("hold",), require_auc=Fraction(9, 10))
     (never,) = run(tmp_path / "never", study).required
     assert (never["scale"], never["speed_up"], never["beyond"]) == (None, None, "0")
     assert never["auc_without_latency"] < 0.9
+
+
+def test_times_that_belong_to_no_trace_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(LaeError, match="timing: .*none of the traces is of the same tracker"):
+        run(tmp_path, Study((str(SLOW),), timing=(str(FAST),)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_means_rest_on_is_said(tmp_path: Path) -> None:
+    few = tmp_path / "few.parquet"
+    trace = lae_sim.read_trace(SLOW, FEW[:2])
+    lae_sim.write_trace(trace, few)
+    study = Study((str(FAST), str(few)), sequences=(), costs=("kalman=2ms",))
+    notes = run(tmp_path / "out", study).notes()
+    assert "synthetic: its traces do not have the same sequences: compare no means" in notes
+    assert "few: times: synthetic (made up, not measured)" in notes
+    assert "answers come later by what forecasting costs: kalman 2000 us" in notes
 
 
 # ------------------------------------------------------------------------------ resuming
@@ -323,7 +343,9 @@ def test_what_is_trained_is_not_trained_again(
     results = run(tmp_path, study)
     notes = results.notes()
     assert any("trained in 5 folds over 8 sequences" in note for note in notes)
-    table = compare({"slow": lae_sim.read_trace(SLOW)}, {"tuned-kalman": KalmanTrainer()})
+    table = compare_forecasters(
+        {"slow": lae_sim.read_trace(SLOW)}, {"tuned-kalman": KalmanTrainer()}
+    )
     scores = table.query("forecaster == 'tuned-kalman' and metric == 'auc'").set_index("sequence")
     found = results.table().query("forecaster == 'tuned-kalman'").set_index("sequence")
     assert found["auc"].to_dict() == scores["value"].to_dict()

@@ -104,7 +104,7 @@ def test_table2_shows_scale_1_and_changes(results):
 def test_pairs_and_requirements(results):
     view = View(results)
     [*names, _, p, holm, _, _] = comparison_table(view).header
-    assert names == ["scale", "forecaster", "a", "b"]
+    assert names == ["scale", "forecaster", "a", "b", "n"]
     assert (p, holm) == ("p", "p (Holm)")
     rows = required_table(view).rows
     assert [row[0].value for row in rows] == ["one", "one", "two", "two"]
@@ -135,7 +135,8 @@ def test_golden_latex():
     table = Table("t", "What 50% is", ("tracker", "f", "Δ"), rows, 2, (("D&D", 1),))
     assert latex(table) == "\n".join([
         "% What 50% is",
-        r"% \usepackage{booktabs}",
+        r"% \usepackage{booktabs}; if it is too wide: \usepackage{adjustbox} and",
+        r"% \adjustbox{max width=\linewidth}{\input{t}}",
         r"\begin{tabular}{@{}llr@{}}",
         r"\toprule",
         r" &  & \multicolumn{1}{c}{D\&D} \\",
