@@ -264,7 +264,7 @@ def test_what_a_required_auc_asks_for_is_true(tmp_path: Path) -> None:
 
 
 def test_times_that_belong_to_no_trace_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(LaeError, match="timing: .*none of the traces is of the same tracker"):
+    with pytest.raises(LaeError, match=r"timing: .*none of the traces is of the same tracker"):
         run(tmp_path, Study((str(SLOW),), timing=(str(FAST),)))
     assert not list(tmp_path.iterdir())
 
