@@ -84,43 +84,52 @@ def _together(
         return [None] * width
     taken *= clock.ticks_per_ns
     by_call = np.array([lane.by_call for lane in times])
-    in_turn = taken.T.copy() if by_call.all() else None
-    # one row for each call of all lanes, and room for the steps after the end of the last one
-    frames, starts, ready = done = np.empty((3, taken.shape[1] + 1, width), np.int64)
+    all_by_call = bool(by_call.all())
+    ends = lengths * interval
+    # one row for each call of all lanes, and the next call's beginning; then moved to lane by lane
+    frames, starts, ready = rows = np.empty((3, _STEPS + 1, width), np.int64)
     frames[0] = starts[0] = 0
+    done = np.empty((3, *taken.shape), np.int64)
     calls = np.zeros(width, np.int64)
     faulty = np.zeros(width, np.bool_)
     runs = np.ones(width, np.bool_)
     k = first = 0  # the lanes before the first have ended
     while first < width:
-        here, rest = slice(k, k + _STEPS), slice(first, None)
-        after = slice(k + 1, k + _STEPS + 1)
+        rest, here = slice(first, None), slice(k, k + _STEPS)
+        in_turn = taken[rest, here].T.copy() if all_by_call else None
         row = np.arange(first, width) * taken.shape[1]
-        frame, start = frames[k, rest], starts[k, rest]
-        rows = zip(frames[after, rest], starts[after, rest], ready[here, rest])
-        for step, (following, begin, end) in enumerate(rows, k):
+        frame, start = frames[0, rest], starts[0, rest]
+        steps = zip(frames[1:, rest], starts[1:, rest], ready[:-1, rest])
+        for step, (following, begin, end) in enumerate(steps):
             if in_turn is None:
-                at = np.where(by_call[rest], step, frame)
+                at = np.where(by_call[rest], k + step, frame)
                 np.add(start, taken.take(row + at, mode="clip"), out=end)
             else:
-                np.add(start, in_turn[step, rest], out=end)
+                np.add(start, in_turn[step], out=end)
             following[:] = policy.next_lanes(clock, frame, end)
-            np.maximum(end, following * interval, out=begin)
+            np.multiply(following, interval, out=begin)
+            np.maximum(end, begin, out=begin)
             frame, start = following, begin
-        running = np.empty((_STEPS + 1, width - first), np.bool_)
-        running[0] = runs[rest]
-        running[1:] = (frames[after, rest] < lengths[rest]) & (
-            starts[after, rest] < lengths[rest] * interval
-        )
-        np.logical_and.accumulate(running, out=running)
-        calls[rest] += running[:-1].sum(axis=0)
-        wrong = running[:-1] & (ready[here, rest] < starts[here, rest])
-        wrong |= running[1:] & (frames[after, rest] <= frames[here, rest])
-        faulty[rest] |= wrong.any(axis=0)
-        runs[rest] = running[-1] & ~faulty[rest]
+        done[:, rest, here] = rows[:, :-1, rest].transpose(0, 2, 1)
+        wrong = ready[:-1, rest] < starts[:-1, rest]
+        backwards = frames[1:, rest] <= frames[:-1, rest]
+        last = runs[rest] & (frame < lengths[rest]) & (start < ends[rest])
+        if last.all() and not wrong.any() and not backwards.any():
+            calls[rest] += _STEPS  # both ascend, so that none has ended in between
+        else:
+            running = np.empty((_STEPS + 1, width - first), np.bool_)
+            running[0] = runs[rest]
+            running[1:] = (frames[1:, rest] < lengths[rest]) & (starts[1:, rest] < ends[rest])
+            np.logical_and.accumulate(running, out=running)
+            calls[rest] += running[:-1].sum(axis=0)
+            wrong &= running[:-1]
+            wrong |= running[1:] & backwards
+            faulty[rest] |= wrong.any(axis=0)
+            runs[rest] = running[-1] & ~faulty[rest]
         first = int(np.append(runs, True)[first:].argmax()) + first
+        frames[0], starts[0] = frames[-1], starts[-1]
         k += _STEPS
-    lane_by_lane = zip(*done[:, : calls.max()].transpose(0, 2, 1).copy())
+    lane_by_lane = zip(*done)
     return [
         None if bad else Schedule(clock, length, frames[:n], starts[:n], ready[:n])
         for (frames, starts, ready), bad, length, n in zip(

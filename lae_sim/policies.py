@@ -50,8 +50,8 @@ class _Latest:
         return last + 1, (last + 1) * clock.frame_ticks
 
     def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
-        following: Ints = np.maximum(now // clock.frame_ticks, last + 1)
-        return following
+        following: Ints = now // clock.frame_ticks
+        return np.maximum(following, last + 1, out=following)
 
 
 @dataclass(frozen=True)
