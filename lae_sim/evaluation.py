@@ -20,7 +20,7 @@ from lae_sim.run import Run
 from lae_sim.scoring import Scorer
 from lae_sim.trace import BATCH_ROWS, batched
 
-_PART = 1 << 20  # outputs that forecasters are fed at once
+_PART = 1 << 19  # outputs that forecasters are fed at once
 
 
 @dataclass(frozen=True, eq=False)
