@@ -28,6 +28,7 @@ SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
 MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
 _NEVER = 2**62
 _WIDE = 8  # from so many sigmas on, reduceat is slower than a loop over the sequences
+_CELLS = 1 << 17  # outputs x sigmas at once, so that they stay in the cache
 Frames = npt.NDArray[np.int32]
 
 
@@ -64,12 +65,13 @@ class Pairing:
     @property
     def mismatch_sum(self) -> Ints:
         """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""
-        answered = self.end - self.first
         if len(self.sigmas) < _WIDE:
+            answered = self.end - self.first
             source_sum = np.add.reduceat(answered * self.frames[:, None], self.offsets[:-1])
         else:
-            spans = map(slice, self.offsets[:-1], self.offsets[1:])
-            source_sum = np.stack([self.frames[span] @ answered[span] for span in spans])
+            source_sum = np.stack(
+                [self.frames[s] @ (self.end[s] - self.first[s]) for s in self._spans()]
+            )
         return (self.lengths * (self.lengths - 1) // 2)[:, None] - source_sum
 
     @property
@@ -77,20 +79,23 @@ class Pairing:
         """Largest i - psi(i) of each sequence, frames, int64 [S, M]."""
         # An output that answers nothing cannot have the maximum: the query before its turn was
         # answered by an older one.
-        late = self.end - (self.frames + 1).astype(np.int32)[:, None]
-        return self._largest(late)
+        return self._largest_gap((self.frames + 1).astype(np.int32)[:, None])
 
     @property
     def longest_hold(self) -> Ints:
         """Most queries in a row that one output answered, frames, int64 [S, M]."""
-        return self._largest(self.end - self.first)
+        return self._largest_gap(self.first)
 
-    def _largest(self, values: Frames) -> Ints:
-        """The largest value of each sequence, int64 [S, M]."""
+    def _largest_gap(self, begin: Frames) -> Ints:
+        """The largest distance of ``end`` from another frame in each sequence, int64 [S, M]."""
         if len(self.sigmas) < _WIDE:
-            return np.maximum.reduceat(values, self.offsets[:-1]).astype(np.int64)
-        spans = map(slice, self.offsets[:-1], self.offsets[1:])
-        return np.stack([values[span].max(axis=0) for span in spans]).astype(np.int64)
+            return np.maximum.reduceat(self.end - begin, self.offsets[:-1]).astype(np.int64)
+        largest = [(self.end[span] - begin[span]).max(axis=0) for span in self._spans()]
+        return np.stack(largest).astype(np.int64)
+
+    def _spans(self) -> Iterator[slice]:
+        """The outputs of each sequence: few enough that what is made of them stays in the cache."""
+        return map(slice, self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
 
 def pair(
@@ -164,9 +169,16 @@ def _first_visible(steps: Ints, sigmas: Ints, scale: int, lengths: Ints) -> Fram
     frame, rest = np.divmod(steps, scale)
     whole, part = np.divmod(sigmas, scale)
     frame = np.clip(frame, -MOST_FRAMES, MOST_FRAMES).astype(np.int32)[:, None]
-    first = frame - whole.astype(np.int32) + (rest[:, None] > part)
-    limited: Frames = np.clip(first, 0, lengths.astype(np.int32)[:, None], out=first)
-    return limited
+    rest, whole, limit = rest[:, None], whole.astype(np.int32), lengths.astype(np.int32)[:, None]
+    first = np.empty((len(steps), len(sigmas)), np.int32)
+    rows = max(_CELLS // len(sigmas), 1)
+    for begin in range(0, len(steps), rows):
+        now = slice(begin, begin + rows)
+        some = np.subtract(frame[now], whole, out=first[now])
+        some += rest[now] > part
+        np.maximum(some, 0, out=some)
+        np.minimum(some, limit[now], out=some)
+    return first
 
 
 @dataclass(frozen=True)
