@@ -71,7 +71,7 @@ class CellRows:
         import pyarrow as pa
 
         count = len(self._sigmas)
-        calls = np.maximum(part.processed - 1, 1)
+        calls = np.where(part.processed > 1, part.processed - 1, np.nan)
         once: dict[str, npt.NDArray[Any]] = {  # by sequence
             "repetition": repetitions,
             "world_frames": part.frames,

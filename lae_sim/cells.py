@@ -46,11 +46,13 @@ class Input:
         path: file or URL.
         label: its name in tables.
         digest: SHA-256 of its content.
+        stamp: size and time of a local file when the digest was taken; empty of any other.
     """
 
     path: str
     label: str
     digest: str
+    stamp: str = ""
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,9 @@ def exit_status(work: Callable[[], None], program: str) -> int:
         return 130
     except BrokenPipeError:  # the reader, such as head, has gone: stay silent from here on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(f"{program}: error: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim.cells import Cell, replayed
+from lae_sim.errors import LaeError
 from lae_sim.evaluation import evaluate_groups
 from lae_sim.forecast import AnyFactory, Hold
 from lae_sim.metrics import find_convention
@@ -18,7 +19,7 @@ from lae_sim.trace import Trace, read_trace
 
 STEP = Fraction(1, 100)
 MOST = 1 << 13
-"""Scales are looked for in hundredths, up to 81.92 times slower."""
+"""Scales are looked for in hundredths, up to 81.92: all times so much longer."""
 
 _RELATIVE = ("latest", "fifo", "every")  # policies that know no absolute times
 
@@ -49,13 +50,17 @@ class Search:
 
 def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
     """One search for all cells that differ in their scale or repetitions alone."""
-    found: dict[str, Search] = {}
+    counts: dict[Cell, int] = {}
     for cell in cells:
-        setting = replace(cell.setting, scale=Fraction(1), first=0, sigmas=cell.setting.sigmas[:1])
-        if cell.setting.first == 0:
-            search = Search(replace(cell, setting=setting), required)
-            found.setdefault(search.key, search)
-    return list(found.values())
+        setting = replace(
+            cell.setting, scale=Fraction(1), first=0, count=1, sigmas=cell.setting.sigmas[:1]
+        )
+        alike = replace(cell, setting=setting)
+        counts[alike] = max(counts.get(alike, 1), cell.setting.first + cell.setting.count)
+    return [
+        Search(replace(cell, setting=replace(cell.setting, count=count)), required)
+        for cell, count in counts.items()
+    ]
 
 
 def slowest(search: Search) -> dict[str, Any]:
@@ -85,13 +90,15 @@ def slowest(search: Search) -> dict[str, Any]:
         found |= {"beyond": "0", "beyond_auc": known[0]}
     else:
         low, high = 0, 1
-        while high <= MOST and enough(high):
+        while enough(high) and high < MOST:
             low, high = high, 2 * high
+        if enough(high):
+            low = high
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (middle, high) if enough(middle) else (low, middle)
         found |= {"scale": str(low * STEP), "auc": known[low]}
-        if high in known:
+        if high > low:
             found |= {"beyond": str(high * STEP), "beyond_auc": known[high]}
     return {**found, "auc_without_latency": known[0]}
 
@@ -108,7 +115,10 @@ def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
         find_convention(cell.convention),
         costs={cell.forecaster: cell.cost_ns},
     )
-    return float(np.nanmean(np.concatenate([part.scores["auc"][0, :, 0] for part in parts])))
+    scores = np.concatenate([part.scores["auc"][0, :, 0] for part in parts])
+    if np.isnan(scores).all():
+        raise LaeError("no sequence counts in the mean AUC: its truth is nowhere valid")
+    return float(np.nanmean(scores))
 
 
 def requirement(search: Search, found: Mapping[str, Any]) -> dict[str, Any]:

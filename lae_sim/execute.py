@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +22,7 @@ AHEAD = 3
 """Tasks that are handed out for each worker, so that none waits and few results are held."""
 
 Item = TypeVar("Item")
+_CELLS = "[0-9a-f]" * 32 + ".parquet"
 _GOES_ON = "what is finished is kept, and the same command goes on from there"
 
 
@@ -37,6 +39,28 @@ class Store:
             self.folder / name for name in ("results", "about", "unused")
         )
 
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other studies out of the folder, where the system can.
+
+        Raises:
+            LaeError: if one is at work there.
+        """
+        try:
+            import fcntl
+        except ImportError:  # Windows
+            yield
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self.folder, os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield
+        except BlockingIOError as error:
+            raise LaeError(f"{self.folder}: another study is writing there") from error
+        finally:
+            os.close(descriptor)
+
     def prepare(self, cells: Iterable[Cell]) -> None:
         """Make the folder, bring the cells of the plan back, and set those of others aside.
 
@@ -45,15 +69,16 @@ class Store:
         """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            if any(self.folder.iterdir()) and not self.results.is_dir():
+            folders = (self.results, self._about, self._unused)
+            if any(self.folder.iterdir()) and not all(path.is_dir() for path in folders):
                 raise LaeError(f"{self.folder}: is not empty and not of a study: name another")
-            for path in (self.results, self._about, self._unused):
+            for path in folders:
                 path.mkdir(exist_ok=True)
             wanted = {f"{cell.key}.parquet" for cell in cells}
-            for path in self.results.glob("[!.]*.parquet"):
+            for path in self.results.glob(_CELLS):
                 if path.name not in wanted:
                     path.replace(self._unused / path.name)
-            for path in self._unused.glob("[!.]*.parquet"):
+            for path in self._unused.glob(_CELLS):
                 if path.name in wanted:
                     path.replace(self.results / path.name)
         except OSError as error:
@@ -102,28 +127,13 @@ class Store:
         return self._about / f"{key}.json"
 
 
-@dataclass(frozen=True)
-class Failure:
-    """Why something could not be computed, in a line or two."""
-
-    reason: str
-
-
-def attempt(work: Callable[[Any], Any], item: Any) -> Any:
-    """What a function makes of an item, or a :class:`Failure` where that is not possible."""
-    try:
-        return work(item)
-    except LaeError as error:
-        return Failure(str(error))
-
-
 def run_all(
     work: Callable[[Item], Any],
     items: Iterable[Item],
     executor: Executor | None = None,
     workers: Callable[[], int] = lambda: 1,
 ) -> Iterator[tuple[Item, Any]]:
-    """Each item with what a function makes of it, or a :class:`Failure`, as they are finished.
+    """Each item with what a function makes of it, as they are finished.
 
     Args:
         work: a function of a module, that workers can import.
@@ -136,14 +146,14 @@ def run_all(
     """
     if executor is None:
         for item in items:
-            yield item, attempt(work, item)
+            yield item, work(item)
         return
     waiting = iter(items)
     running: dict[Future[Any], Item] = {}
     try:
         while True:
             for item in islice(waiting, max(AHEAD * workers() - len(running), 0)):
-                running[executor.submit(attempt, work, item)] = item
+                running[executor.submit(work, item)] = item
             if not running:
                 return
             done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -170,14 +180,28 @@ def local_executor(workers: int) -> Iterator[Executor]:
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    # not a fork: libraries here have threads; Ctrl-C is for this process alone
-    ignore = (signal.signal, (signal.SIGINT, signal.SIG_IGN))
-    with ProcessPoolExecutor(workers, get_context("spawn"), *ignore) as executor:
+    # not a fork: libraries here have threads
+    start = (get_context("spawn"), _begin, (os.getpid(),))
+    with ProcessPoolExecutor(workers, *start) as executor:
         try:
             yield executor
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
+            for process in list((getattr(executor, "_processes", None) or {}).values()):
+                process.terminate()  # or the end would wait for what they are doing
             raise
+
+
+def _begin(parent: int) -> None:
+    """Begin a worker: Ctrl-C is for its parent alone, and it ends with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager

@@ -69,6 +69,14 @@ def digest(path: str) -> str:
     return whole.hexdigest()
 
 
+def stamp(path: str) -> str:
+    """Size and time of a local file, which change with it; empty of a URL or where it is not."""
+    if is_url(path) or not os.path.exists(path):
+        return ""
+    found = os.stat(path)
+    return f"{found.st_size} {found.st_mtime_ns}"
+
+
 def is_url(path: str) -> bool:
     """Whether fsspec is to find it."""
     return "://" in path

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from lae_sim.cells import Cell, Input, Setting, Task
 from lae_sim.comparison import World, fitted
@@ -18,7 +16,7 @@ from lae_sim.errors import LaeError
 from lae_sim.examples import Trainer
 from lae_sim.files import labels
 from lae_sim.forecast import AnyFactory, Hold
-from lae_sim.locate import digest, find_traces
+from lae_sim.locate import digest, find_traces, stamp
 from lae_sim.metadata import Metadata
 from lae_sim.options import parse_latency, parse_policy
 from lae_sim.study_file import RANDOM, Study
@@ -101,9 +99,9 @@ def make_plan(study: Study, base: Path | None = None) -> Plan:
     own, timed = find_traces(study.traces, base), find_traces(study.timing, base)
     paths = list(dict.fromkeys([*own, *timed]))
     sources = {}
-    for path, label in zip(paths, labels(paths)):
+    for path, label in zip(paths, labels([path.removesuffix(".parquet") for path in paths])):
         trace = read_trace(path)
-        found = Input(path, label.removesuffix(".parquet"), digest(path))
+        found = Input(path, label, digest(path), stamp(path))
         sources[path] = Source(found, trace.metadata, trace.frames or 0)
     traces, timing = [sources[path] for path in own], [sources[path] for path in timed]
     for other in timing:
@@ -147,13 +145,12 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
     for times, policy, fps, latency, scale in product(
         [None, *theirs], study.policies, rates, study.latencies, study.scales
     ):
-        chunk = max(1, CHUNK_FRAMES // max(source.frames, 1))
+        chunk = max(1, CHUNK_FRAMES // (max(source.frames, 1) * max(1, len(study.sigmas) // 8)))
         random = latency in RANDOM
-        sourced = "" if random else _own_code(parse_latency(latency))
         setting = Setting(
             trace=source.input,
             timing=times,
-            code=_own_code(parse_policy(policy)[0]) + sourced,
+            code=_own_code(policy) + _own_code(latency),
             policy=policy,
             fps=fps,
             latency=latency,
@@ -193,16 +190,14 @@ def _code(name: str, forecaster: AnyFactory | Trainer, training: str) -> str:
     kind, _, value = name.partition(":")
     if kind == "learned" and value:
         return digest(value)
-    # of the package itself, the version says it
-    return (training if isinstance(forecaster, Trainer) else "") + _own_code(forecaster)
+    return (training if isinstance(forecaster, Trainer) else "") + _own_code(name)
 
 
-def _own_code(plug_in: Any) -> str:
-    """Digest of the file that a user's plug-in comes from; empty for those of the package."""
-    module = sys.modules.get(getattr(plug_in, "__module__", type(plug_in).__module__))
-    if module is None or module.__name__.partition(".")[0] == "lae_sim":
-        return ""
-    try:
-        return digest(inspect.getsourcefile(module) or "")
-    except (TypeError, LaeError):
-        return ""
+def _own_code(name: str) -> str:
+    """Digest of the file of a plug-in ``package.module:object``; empty of what is not one.
+
+    It must have been imported. (Of the package itself, the version says what is needed.)
+    """
+    module = sys.modules.get(name.rpartition("+")[2].partition(":")[0])
+    path = getattr(module, "__file__", None)
+    return digest(path) if path else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -66,6 +67,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 1 if a part could not be computed, 2 for bad input."""
     arguments = parser().parse_args(argv)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no worker stays behind
     failed: list[bool] = []
     status = exit_status(lambda: failed.append(_study(arguments)), PROGRAM)
     if status == 130:
@@ -94,14 +96,16 @@ def _study(arguments: argparse.Namespace) -> bool:
         write_tables(view, results.folder / "tables")
         write_report(view, results.folder / "report.html")
     else:
-        (results.folder / "report.html").unlink(missing_ok=True)  # it would be of other results
+        for path in [results.folder / "report.html", *(results.folder / "tables").glob("*.*")]:
+            path.unlink(missing_ok=True)  # it would be of other results
     if arguments.json:
         print(json.dumps(results.document(), indent=2, allow_nan=False))
     else:
         from lae_sim.study_text import study_text
 
         print(study_text(results), end="\n\n")
-        print(f"{results.folder}: " + ", ".join(sorted(p.name for p in results.folder.iterdir())))
+        left = sorted(path.name for path in results.folder.glob("[!.]*"))
+        print(f"{results.folder}: {', '.join(left)}")
     return bool(results.failures)
 
 

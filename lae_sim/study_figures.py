@@ -239,7 +239,7 @@ def _sweep(view: View, rows: Sequence[Row], datasets: Sequence[str], key: str) -
 
 def front(view: View) -> Picture | None:
     """AUC against the time of a call, and the Pareto front of each dataset and forecaster."""
-    rows = [row for row in view.standing if row["auc"] is not None]
+    rows = [row for row in view.standing if None not in (row["auc"], row["elapsed_ms"])]
     if not rows:
         return None
     caption = "AUC against the mean time of a call; hollow: hold; lines join what no other tracker"

@@ -69,6 +69,8 @@ class Study:
     def __post_init__(self) -> None:
         if not self.traces:
             raise LaeError("traces: a study needs at least one trace")
+        if self.repetitions > 1_000_000:
+            raise LaeError(f"repetitions: {self.repetitions} are too many: at most a million")
         for latency in self.latencies:
             _check_latency(latency)
         for policy in self.policies:

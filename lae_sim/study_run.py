@@ -14,16 +14,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
-from lae_sim.cells import Task, compute
-from lae_sim.deployment import Search, requirement, searches, slowest
+from lae_sim.cells import Task
+from lae_sim.deployment import requirement, searches
 from lae_sim.errors import LaeError
-from lae_sim.execute import Failure, Store, cluster_executor, local_executor, run_all
+from lae_sim.execute import Store, cluster_executor, local_executor, run_all
 from lae_sim.files import written_whole
 from lae_sim.forecast import AnyFactory
-from lae_sim.plan import Plan, Source, make_plan, tasks
+from lae_sim.plan import Plan, make_plan, tasks
 from lae_sim.study_file import Study
 from lae_sim.study_pairs import compare_traces
 from lae_sim.study_summary import Row, Scores, read_scores, summarise_study
+from lae_sim.study_work import Description, Failure, Work, attempt, cell_told, told
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -125,31 +126,46 @@ def run_study(
     """
     plan = make_plan(study, base)
     store = Store(folder)
+    with store.locked():
+        return _run(plan, store, workers, scheduler, progress)
+
+
+def _run(
+    plan: Plan,
+    store: Store,
+    workers: int | None,
+    scheduler: str | None,
+    progress: Callable[[str, int, int], object],
+) -> StudyResults:
+    study = plan.study
     store.prepare(plan.cells)
     asked = [] if study.require_auc is None else searches(plan.cells, study.require_auc)
-    described = [_About(source, study.sequences) for source in plan.sources]
+    described = [Description(source.input, study.sequences) for source in plan.sources]
     cells = [cell for cell in plan.cells if not store.has(cell)]
     sought = [search for search in asked if store.found(search.key) is None]
     needed = {*(cell.forecaster for cell in cells), *(each.cell.forecaster for each in sought)}
     factories, training = _factories(plan, needed, store, lambda what: progress(what, 0, 1))
-    works: list[_About | Task | Search] = [
-        *(about for about in described if store.found(about.key) is None),
+    works: list[Work] = [
+        *(each for each in described if store.found(each.key) is None),
         *tasks(cells, factories),
         *(replace(search, factory=factories[search.cell.forecaster]) for search in sought),
     ]
     failures, computed = [], 0
     count = min(workers or _cores(), max(len(works), 1))
     with _executor(count, scheduler) as (executor, size):
-        for done, (work, result) in enumerate(run_all(perform, works, executor, size)):
+        for done, (work, result) in enumerate(run_all(attempt, works, executor, size)):
             progress("", done + 1, len(works))
             if isinstance(result, Failure):
-                failures.append({"of": _told(work), "reason": result.reason})
-            elif isinstance(work, Task):
-                computed += len(result)
-                for each in result:
-                    store.put(each)
-            else:
+                failures.append({"of": told(work), "reason": result.reason})
+            elif not isinstance(work, Task):
                 store.keep(work.key, result)
+            else:
+                for cell, found in result:
+                    if isinstance(found, Failure):
+                        failures.append({"of": cell_told(cell), "reason": found.reason})
+                    else:
+                        store.put(found)
+                        computed += 1
     progress("summing up", len(works), len(works))
     scores = tuple(read_scores(plan, store))
     if not scores:
@@ -164,7 +180,7 @@ def run_study(
         required=tuple(
             requirement(search, found) for search in asked if (found := store.found(search.key))
         ),
-        traces=tuple(found for about in described if (found := store.found(about.key))),
+        traces=tuple(found for each in described if (found := store.found(each.key))),
         computed=computed,
         failures=tuple(sorted(failures, key=str)),
         training=tuple(training),
@@ -185,43 +201,6 @@ def _factories(
     factories, notes = plan.trained(progress)
     store.keep(key, {"notes": notes})
     return factories, notes
-
-
-@dataclass(frozen=True)
-class _About:
-    """A trace that is to be described."""
-
-    source: Source
-    sequences: tuple[str, ...]
-
-    @property
-    def key(self) -> str:
-        """Names the description."""
-        return f"{self.source.input.digest[:32]}-trace"
-
-
-def perform(work: _About | Task | Search) -> Any:
-    """Do a piece of a study's work, on some worker."""
-    if isinstance(work, Task):
-        return compute(work)
-    if isinstance(work, Search):
-        return slowest(work)
-    from lae_sim.show import describe
-    from lae_sim.trace import read_trace
-
-    return describe(read_trace(work.source.input.path), work.source.input.label)[0]
-
-
-def _told(work: _About | Task | Search) -> str:
-    """What a piece of work is about."""
-    if isinstance(work, _About):
-        return work.source.input.label
-    setting = work.cells[0].setting if isinstance(work, Task) else work.cell.setting
-    times = "" if setting.timing is None else f" at {setting.timing.label}"
-    return (
-        f"{setting.trace.label}{times}, {setting.policy}, {setting.fps} fps, "
-        f"{setting.latency} x {setting.scale}"
-    )
 
 
 def _cores() -> int:

@@ -316,13 +316,13 @@ def _mark_front(group: Sequence[Row]) -> None:
 
     Rivals are the traces with the same sequences, world, latency, convention, forecaster and sigma.
     """
+    known = [row for row in group if row["auc"] is not None and row["elapsed_ms"] is not None]
     for row in group:
-        row["pareto"] = row["auc"] is not None and not any(
+        row["pareto"] = any(row is one for one in known) and not any(
             other["auc"] >= row["auc"]
             and other["elapsed_ms"] <= row["elapsed_ms"]
             and (other["auc"], other["elapsed_ms"]) != (row["auc"], row["elapsed_ms"])
-            for other in group
-            if other["auc"] is not None
+            for other in known
         )
 
 

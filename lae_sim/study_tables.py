@@ -95,7 +95,8 @@ _RANKING: dict[str, tuple[_Cell, str]] = {
     "offline DP": (_number("offline_dp20"), "without latency"),
     "ms/call": (_number("elapsed_ms", ".1f"), "mean processing time"),
     "skipped": (_share("skip_rate"), "share of frames never processed"),
-    "age ms": (_number("age_ms", ".0f"), "mean age of what answers, at the first sigma"),
+    "age ms": (_number("age_ms", ".0f"), "mean age of the outputs that answer, at the first sigma; "
+               "what forecasting costs is not in it"),
     "stale ms": (_number("longest_stale_ms", ".0f"), "longest time that one output answered"),
     "failed": (_share("failed"), "share of sequences in which an answer misses the target wholly"),
     "to failure s": (_number("time_to_failure_ms", ".1f", 1e-3), "median time to the first such "
@@ -105,6 +106,7 @@ _RANKING: dict[str, tuple[_Cell, str]] = {
     "replay": (_label, "the share of outputs that follow another frame than when recorded"),
     "engine": (_name("engine"), "batch, or simpy where policy or latency need it"),
 }  # fmt: skip
+TABLES = ("ranking", "table2", "attributes", "comparisons", "required")
 _PAPER = ("AUC", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")
 LEGEND = {title: meaning for title, (_, meaning) in _RANKING.items()}
 """What the columns of the ranking mean."""
@@ -280,6 +282,9 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
         comparison_table(view) if results.comparisons else None,
         required_table(view) if results.required else None,
     )
+    for stale in (*Path(folder).glob("*.csv"), *Path(folder).glob("*.tex")):
+        if stale.stem in TABLES:
+            stale.unlink()
     for table in tables:
         if table is not None:
             with written_whole(Path(folder, f"{table.name}.csv")) as temporary:

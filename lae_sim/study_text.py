@@ -88,7 +88,11 @@ def ranking(rows: Sequence[Row]) -> str:
         line += ["-" if p is None else p_label(p), number(row["dp20"])]
         if "jitter of AUC" in header:
             line.append(ends(row, "auc_jitter"))
-        line += [f"{row['elapsed_ms']:.1f}", percent(row["skip_rate"]), age(row.get("age_ms"))]
+        line += [
+            number(row["elapsed_ms"], ".1f"),
+            percent(row["skip_rate"]),
+            age(row.get("age_ms")),
+        ]
         lines.append([*line, "*" if row["pareto"] else ""])
     told = ", ".join(f"{name} {rows[0][name]}" for name in SETTINGS[1:] if name not in differ)
     sigma = rows[0]["sigma"]
@@ -148,7 +152,7 @@ def requirements(rows: Sequence[Row]) -> str:
         [row["trace"], row["times_from"], row["latency"], *(row[name] for name in differ)]
         + [row["forecaster"]]
         + [number(row["required_auc"]), number(row["auc_without_latency"])]
-        + ["-" if row["scale"] is None else f"x {float(eval_scale(row['scale'])):g}"]
+        + ["-" if row["scale"] is None else _most(row)]
         + [number(row["auc"]), number(row["speed_up"], ".2f"), number(row["fps_at_most"], ".1f")]
         for row in rows
     ]
@@ -157,6 +161,11 @@ def requirements(rows: Sequence[Row]) -> str:
         "fps at most: how fast the\nworld may move, with the recorded motion from frame to frame "
         "(unknown where a cost or a policy has a time of its own)"
     )
+
+
+def _most(row: Row) -> str:
+    """The scale of a requirement, and whether the search ended there."""
+    return f"{'x' if row['beyond'] else 'x >='} {eval_scale(row['scale']):g}"
 
 
 def eval_scale(text: str) -> float:

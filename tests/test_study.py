@@ -38,6 +38,8 @@ FEW = ("bike-pan", "car-chase", "person-crowd")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 OWN = """
+import functools
+
 class EveryOther:
     def __call__(self, clock, calls):
         last, _, now = calls[-1]
@@ -50,6 +52,15 @@ class Deadly:
     def __init__(self, box, image_size=None):
         import os
         os.kill(os.getpid(), 9)
+
+class Confused:
+    def __init__(self, box, image_size=None):
+        raise ZeroDivisionError("of my own")
+
+def lazy(box, image_size=None, step=1):
+    return Stay(box)
+
+partial = functools.partial(lazy, step=2)
 
 class Stay:
     def __init__(self, box, image_size=None):
@@ -318,7 +329,7 @@ def test_the_code_of_an_own_forecaster_is_an_input(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own_of_study.py").write_text(OWN)
-    path = toml(tmp_path, traces=[str(FAST)], forecasters=["own_of_study:Stay"])
+    path = toml(tmp_path, traces=[str(FAST)], forecasters=["own_of_study:partial"])
     for expected in ("2 of them computed", "0 of them computed"):
         assert expected in study_command(path, "--no-report", cwd=tmp_path)
     (tmp_path / "own_of_study.py").write_text(OWN + "# changed\n")
@@ -474,6 +485,64 @@ def test_a_worker_that_dies_is_told_in_a_line(tmp_path: Path) -> None:
     assert "a worker died" in told
     assert "the same command goes on from there" in told
     assert told.count("\n") == 1
+
+
+def test_a_forecaster_that_fails_costs_itself_alone(tmp_path: Path) -> None:
+    (tmp_path / "confused_of_study.py").write_text(OWN)
+    path = toml(tmp_path, forecasters=["kalman", "confused_of_study:Confused"])
+    for workers in (1, 2):
+        told = study_command(
+            path, "--no-report", "--json", "--workers", workers, cwd=tmp_path, status=1
+        )
+        document = json.loads(told)
+        assert {row["forecaster"] for row in document["summary"]} == {"hold", "kalman"}
+        assert len(document["failures"]) == 2
+        for failure in document["failures"]:
+            assert "confused_of_study:Confused" in failure["of"]
+            assert "ZeroDivisionError: of my own" in failure["reason"]
+
+
+def test_a_trace_that_changes_meanwhile_is_not_taken_for_what_it_was(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.parquet"
+    shutil.copy(FAST, mine)
+
+    def progress(what: str, done: int, total: int) -> None:
+        if done == 1:
+            shutil.copy(SLOW, mine)
+
+    study = Study((str(mine),), sequences=FEW, scales=(Fraction(1), Fraction(2)))
+    with pytest.raises(LaeError, match="changed since the study began"):
+        run_study(study, tmp_path / "out", workers=1, progress=progress)
+    shutil.copy(FAST, mine)
+    assert run(tmp_path / "out", study).computed == 4
+
+
+def test_files_of_alike_names_keep_apart(tmp_path: Path) -> None:
+    shutil.copy(SLOW, tmp_path / "a")
+    shutil.copy(FAST, tmp_path / "a.parquet")
+    study = Study((str(tmp_path / "a"), str(tmp_path / "a.parquet")), sequences=FEW)
+    rows = run(tmp_path / "out", study).summary
+    assert len({row["auc"] for row in rows}) == len(rows) == 4
+
+
+def test_a_folder_has_one_study_at_a_time(tmp_path: Path) -> None:
+    from lae_sim.execute import Store
+
+    with Store(tmp_path).locked(), pytest.raises(LaeError, match="another study is writing there"):
+        run(tmp_path)
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "mine.parquet").write_text("mine")
+    with pytest.raises(LaeError, match="not of a study"):
+        run(tmp_path)
+    assert (tmp_path / "results" / "mine.parquet").read_text() == "mine"
+
+
+def test_a_tracker_slower_than_its_sequences_has_no_time_of_a_call(tmp_path: Path) -> None:
+    results = run(tmp_path, latencies=("constant:100s",), forecasters=("hold",))
+    assert {row["elapsed_ms"] for row in results.summary} == {None}
+    assert not any(row["pareto"] for row in results.summary)
+    lae_sim.write_report(results, tmp_path / "report.html")
+    lae_sim.write_tables(results, tmp_path / "tables")
 
 
 @pytest.mark.parametrize(
