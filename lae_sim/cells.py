@@ -29,7 +29,7 @@ from lae_sim.notes import notes_on
 from lae_sim.options import parse_latency, parse_policy
 from lae_sim.run import Run, replay_repeated, replay_trace
 from lae_sim.study_file import RANDOM
-from lae_sim.trace import Trace, read_trace
+from lae_sim.trace import Trace, held, read_trace
 
 VERSION = 1
 """Of the cells' files; another version is another cell."""
@@ -201,7 +201,7 @@ def compute(task: Task) -> list[Result]:
 def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> list[Result]:
     """The results of cells of one setting and one convention."""
     setting, convention = cells[0].setting, find_convention(cells[0].convention)
-    trace = read_trace(setting.trace.path, setting.sequences or None)
+    trace = held(read_trace(setting.trace.path, setting.sequences or None))
     chosen = {cell.forecaster: factories[cell.forecaster] for cell in cells}
     costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
     writers = [CellRows(setting.sigmas, cell.about(trace.metadata)) for cell in cells]

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim.arrow import from_numpy, to_numpy
+from lae_sim.arrow import to_numpy
 from lae_sim.boxes import Floats
 from lae_sim.cell_rows import COLUMNS, read_rows
 from lae_sim.cells import Cell, Setting
@@ -112,9 +112,8 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
             return to_numpy(rows.column(name).chunk(0), COLUMNS[name]).astype(np.float64)
 
         entries = rows.num_rows // count
-        told = (
-            rows.column("sequence").take(from_numpy(np.arange(0, rows.num_rows, count))).to_pylist()
-        )
+        sequences = rows.column("sequence").chunk(0)  # its take would import pyarrow.compute
+        told = [sequences[row].as_py() for row in range(0, rows.num_rows, count)]
         names = tuple(sorted(set(told)))
         place = {name: s for s, name in enumerate(names)}
         order = np.lexsort((  # by repetition, then by sequence

@@ -24,6 +24,7 @@ from lae_sim.recording import Recording
 from lae_sim.rows import BOX, TRUTH, Rows
 
 BATCH_ROWS = 1 << 15
+HELD_FRAMES = 1 << 18
 Item = TypeVar("Item", bound=Sized)
 
 
@@ -61,6 +62,17 @@ def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None =
     stored = _StoredRecordings(os.fspath(path), None if sequences is None else frozenset(sequences))
     metadata, rows = stored.describe()
     return Trace(metadata, replace(stored, profiled=metadata.profiled), rows)
+
+
+def held(trace: Trace) -> Trace:
+    """The trace, kept in memory from the start if it is small enough to be scored at once.
+
+    Raises:
+        TraceError: if it is not a valid trace.
+    """
+    if trace.frames is None or trace.frames > HELD_FRAMES:
+        return trace
+    return replace(trace, recordings=list(trace))
 
 
 def validate(path: str | os.PathLike[str]) -> None:
