@@ -175,7 +175,12 @@ def _wide(table: pd.DataFrame, metrics: Sequence[str]) -> tuple[pd.DataFrame, di
 def bootstrap_weights(count: int, resamples: int, seed: int) -> Floats:
     """Share of each sequence in each resample, float64 [resamples, count]; rows sum to 1."""
     generator = np.random.Generator(np.random.PCG64(seed))
-    return generator.multinomial(count, np.full(count, 1 / count), size=resamples) / count
+    weights = np.empty((resamples, count))
+    for row in range(0, resamples, 100):  # the same stream, without another array as large
+        some = weights[row : row + 100]
+        drawn = generator.multinomial(count, np.full(count, 1 / count), size=len(some))
+        np.divide(drawn, count, out=some)
+    return weights
 
 
 def _compared(
