@@ -178,7 +178,6 @@ def size_lines(folder: Path, rounds: int, largest: int) -> list[list[str]]:
     for times in (1, 10, 100):
         if times > largest:
             break
-        # a slow tracker: its 51 sigmas have 51 histories as a rule, so that groups are full
         trace = write_tracker(folder / f"x{times}.parquet", 20, 0.1, times)
         work = study(folder, [trace], ["hold", "kalman"], "--workers", "2")
         cost = in_turn({"": work}, rounds if times == 1 else 1)[""]
