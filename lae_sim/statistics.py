@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lae_sim.boxes import Floats
 from lae_sim.errors import LaeError
@@ -20,6 +21,8 @@ from lae_sim.report import table as text_table
 
 if TYPE_CHECKING:
     import pandas as pd
+
+Counts = npt.NDArray[np.unsignedinteger[Any]]
 
 ALL_TRACES = "all traces"
 ALL_SEQUENCES = "all sequences"
@@ -32,6 +35,7 @@ METRIC_LABELS = {
     "mdp20": "mDP@20",
 }
 _KEYS = ["attribute", "trace", "latency", "scale", "sigma", "forecaster", "metric"]
+_ROWS = 200  # resamples at once
 _NOISE_DECIMALS = 12  # equal differences of scores in 0..1 are equal to this many decimals
 
 
@@ -83,7 +87,7 @@ def summarise(
         raise LaeError("a bootstrap needs resamples >= 1 and 0 < confidence < 1")
     baselines = [name for name in baselines if (table["forecaster"] == name).any()]
     wide, order = _wide(table, metrics)
-    weights: dict[int, Floats] = {}
+    counts: dict[int, Counts] = {}
     parts = []
     keys = [key for key in order if key != "forecaster"]
     for values, group in wide.groupby(keys, sort=False):
@@ -93,10 +97,10 @@ def summarise(
         count = len(group)
         if not count or not present:
             continue
-        if count not in weights:
-            weights[count] = bootstrap_weights(count, resamples, seed)
+        if count not in counts:
+            counts[count] = bootstrap_counts(count, resamples, seed)
         scores = np.ascontiguousarray(group[present].to_numpy(np.float64).T)
-        columns = _compared(scores, present, weights[count], baselines, confidence)
+        columns = _compared(scores, present, counts[count], baselines, confidence)
         columns = {"forecaster": present, "sequences": count, **columns}
         parts.append(pd.DataFrame({**dict(zip(keys, values)), **columns}))
     if not parts:
@@ -172,21 +176,30 @@ def _wide(table: pd.DataFrame, metrics: Sequence[str]) -> tuple[pd.DataFrame, di
     return wide, order
 
 
-def bootstrap_weights(count: int, resamples: int, seed: int) -> Floats:
-    """Share of each sequence in each resample, float64 [resamples, count]; rows sum to 1."""
+def bootstrap_counts(count: int, resamples: int, seed: int) -> Counts:
+    """How often each sequence is in each resample, uint16 [resamples, count] (or wider)."""
     generator = np.random.Generator(np.random.PCG64(seed))
-    weights = np.empty((resamples, count))
-    for row in range(0, resamples, 100):  # the same stream, without another array as large
-        some = weights[row : row + 100]
-        drawn = generator.multinomial(count, np.full(count, 1 / count), size=len(some))
-        np.divide(drawn, count, out=some)
-    return weights
+    counts = np.empty((resamples, count), np.uint16 if count < 2**16 else np.uint32)
+    for row in range(0, resamples, _ROWS):  # the same stream, without a large array
+        some = counts[row : row + _ROWS]
+        some[:] = generator.multinomial(count, np.full(count, 1 / count), size=len(some))
+    return counts
+
+
+def resampled_means(values: Floats, counts: Counts) -> Floats:
+    """The mean of each row of values [F, S] in each resample, float64 [F, resamples]."""
+    # not a product by BLAS, where a row's last bits depend on the number of rows
+    blocks = [
+        np.einsum("fs,rs->fr", values, counts[row : row + _ROWS] / counts.shape[1])
+        for row in range(0, len(counts), _ROWS)
+    ]
+    return np.concatenate(blocks, axis=1)
 
 
 def _compared(
     scores: Floats,
     names: Sequence[str],
-    weights: Floats,
+    counts: Counts,
     baselines: Sequence[str],
     confidence: float,
 ) -> dict[str, Any]:
@@ -199,8 +212,7 @@ def _compared(
         columns[f"{prefix}low"], columns[f"{prefix}high"] = np.quantile(samples, tails, axis=1)
 
     mean = scores.mean(axis=1)
-    # not a product by BLAS, where a row's last bits depend on the number of rows
-    resampled = np.einsum("fs,rs->fr", scores, weights)
+    resampled = resampled_means(scores, counts)
     unknown = np.full(len(names), np.nan)
     add("mean", mean, resampled, "")
     for baseline in baselines:

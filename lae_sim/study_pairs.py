@@ -9,7 +9,7 @@ import numpy as np
 
 from lae_sim.boxes import Floats
 from lae_sim.pairing import SIGMA_GRID
-from lae_sim.statistics import bootstrap_weights, signed_rank_p
+from lae_sim.statistics import Counts, bootstrap_counts, resampled_means, signed_rank_p
 from lae_sim.study_summary import MEAN, RESAMPLES, Row, Scores, ends
 
 
@@ -30,10 +30,10 @@ def compare_traces(
     together: dict[tuple[str, ...], list[Scores]] = {}
     for each in scores:
         together.setdefault((*each.group, each.forecaster), []).append(each)
-    weights: dict[int, Floats] = {}
+    counts: dict[int, Counts] = {}
     rows = []
     for group in together.values():
-        ours = [_pair(a, b, seed, resamples, weights) for a, b in combinations(group, 2)]
+        ours = [_pair(a, b, seed, resamples, counts) for a, b in combinations(group, 2)]
         known = [row for row in ours if row is not None]
         previous = 0.0
         for rank, row in enumerate(sorted(known, key=lambda row: row["p"])):
@@ -42,9 +42,7 @@ def compare_traces(
     return rows
 
 
-def _pair(
-    a: Scores, b: Scores, seed: int, resamples: int, weights: dict[int, Floats]
-) -> Row | None:
+def _pair(a: Scores, b: Scores, seed: int, resamples: int, counts: dict[int, Counts]) -> Row | None:
     """A against B; None if they have no sequences in common that count."""
     whole = set(SIGMA_GRID) == set(a.setting.sigmas)
     which = "over_sigmas" if whole else "repeated"
@@ -58,15 +56,14 @@ def _pair(
         return None
     ours, theirs = ours[:, kept], theirs[:, kept]
     count = ours.shape[1]
-    if count not in weights:
-        weights[count] = bootstrap_weights(count, resamples, seed)
-    drawn = weights[count]
+    if count not in counts:
+        counts[count] = bootstrap_counts(count, resamples, seed)
     difference = ours.mean(axis=0) - theirs.mean(axis=0)
-    margins = np.einsum("s,rs->r", difference, drawn)
+    (margins,) = resampled_means(difference[None], counts[count])
     low, high = ends(margins)
     jitter = len(ours) > 1 or len(theirs) > 1
     if jitter:
-        margins = _drawn_margins(ours, theirs, drawn, seed)
+        margins = _drawn_margins(ours, theirs, counts[count], seed)
     here = np.sign(np.round(ours.mean(axis=1)[:, None] - theirs.mean(axis=1), 12))
     setting = a.setting
     return {
@@ -90,14 +87,16 @@ def _pair(
     }
 
 
-def _drawn_margins(ours: Floats, theirs: Floats, weights: Floats, seed: int) -> Floats:
+def _drawn_margins(ours: Floats, theirs: Floats, counts: Counts, seed: int) -> Floats:
     """Differences in resamples of the sequences, each with a repetition drawn for each sequence."""
-    resamples, count = weights.shape
+    resamples, count = counts.shape
     random = np.random.Generator(np.random.PCG64([seed, count, len(ours), len(theirs)]))
     margins = np.zeros(resamples)
     for s in range(count):  # one sequence after another: resamples x sequences would be large
         run = ours[random.integers(0, len(ours), resamples), s]
-        margins += weights[:, s] * (run - theirs[random.integers(0, len(theirs), resamples), s])
+        margins += (
+            counts[:, s] / count * (run - theirs[random.integers(0, len(theirs), resamples), s])
+        )
     return margins
 
 

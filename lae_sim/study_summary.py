@@ -23,7 +23,7 @@ from lae_sim.execute import Store
 from lae_sim.metrics import METRICS
 from lae_sim.pairing import SIGMA_GRID
 from lae_sim.plan import Plan, Source
-from lae_sim.statistics import bootstrap_weights, signed_rank_p
+from lae_sim.statistics import Counts, bootstrap_counts, resampled_means, signed_rank_p
 
 RESAMPLES = 10_000
 MEAN = "mean"
@@ -163,11 +163,11 @@ def summarise_study(
         the rows of the first sigma and of the mean over sigma.
     """
     hold = {(*_identity(s),): s for s in scores if s.forecaster == "hold"}
-    weights: dict[int, Floats] = {}
+    counts: dict[int, Counts] = {}
     rows: list[Row] = []
     rivals: dict[tuple[Any, ...], list[Row]] = {}
     for each in scores:
-        ours = [*_rows(each, hold.get(_identity(each)), seed, resamples, weights)]
+        ours = [*_rows(each, hold.get(_identity(each)), seed, resamples, counts)]
         for row in ours:
             rival = (*each.group, each.sequences, each.forecaster, row["sigma"])
             rivals.setdefault(rival, []).append(row)
@@ -185,7 +185,7 @@ def _identity(scores: Scores) -> tuple[str, ...]:
 
 
 def _rows(
-    scores: Scores, hold: Scores | None, seed: int, resamples: int, weights: dict[int, Floats]
+    scores: Scores, hold: Scores | None, seed: int, resamples: int, counts: dict[int, Counts]
 ) -> Iterator[Row]:
     setting, metadata = scores.setting, scores.source.metadata
     clock = Clock.at(setting.fps)
@@ -217,7 +217,7 @@ def _rows(
         at = {metric: scores.means[metric][:, s] for metric in METRICS}
         row: Row = {**told, "sigma": str(sigma), **{m: _mean(v) for m, v in at.items()}, **offline}
         if s == 0:
-            row |= _uncertain(scores, hold, "repeated", seed, resamples, weights)
+            row |= _uncertain(scores, hold, "repeated", seed, resamples, counts)
         row |= _stale(scores, s, sigma, clock, frames)
         yield row
     if set(SIGMA_GRID) <= set(setting.sigmas):
@@ -225,7 +225,7 @@ def _rows(
         means = {m: _mean_of_means(scores.means[m][:, grid]) for m in METRICS}
         row = {**told, "sigma": MEAN, **means, **offline}
         if len(grid) == len(setting.sigmas):
-            row |= _uncertain(scores, hold, "over_sigmas", seed, resamples, weights)
+            row |= _uncertain(scores, hold, "over_sigmas", seed, resamples, counts)
         yield row
 
 
@@ -235,7 +235,7 @@ def _uncertain(
     which: str,
     seed: int,
     resamples: int,
-    weights: dict[int, Floats],
+    counts: dict[int, Counts],
 ) -> Row:
     """Intervals of the means, what is won over hold, and the share of the loss recovered."""
     found: Row = {}
@@ -249,25 +249,24 @@ def _uncertain(
         if not kept.any():
             continue
         count = int(kept.sum())
-        if count not in weights:
-            weights[count] = bootstrap_weights(count, resamples, seed)
-        drawn = weights[count]
+        if count not in counts:
+            counts[count] = bootstrap_counts(count, resamples, seed)
         mean = ours[:, kept].mean(axis=0)
-        resampled = np.einsum("s,rs->r", mean, drawn)
+        bare = mean if base is None else base[:, kept].mean(axis=0)
+        rows = np.stack([mean, bare, offline[kept] - bare])
+        resampled, held, lost = resampled_means(rows, counts[count])
         found[f"{metric}_low"], found[f"{metric}_high"] = ends(resampled)
         if len(ours) > 1:
             jitter = ends(ours[:, kept].mean(axis=1))
             found[f"{metric}_jitter_low"], found[f"{metric}_jitter_high"] = jitter
         if base is None:
             continue
-        bare = base[:, kept].mean(axis=0)
-        won = resampled - np.einsum("s,rs->r", bare, drawn)
+        won = resampled - held
         found[f"vs_hold_{metric}"] = float(mean.mean() - bare.mean())
         found[f"vs_hold_{metric}_low"], found[f"vs_hold_{metric}_high"] = ends(won)
         found[f"vs_hold_{metric}_p"] = signed_rank_p(np.round(mean - bare, 12))
         if not np.isnan(offline[kept]).any():
             loss = float(offline[kept].mean() - bare.mean())
-            lost = np.einsum("s,rs->r", offline[kept] - bare, drawn)
             if loss > 0:
                 found[f"recovered_{metric}"] = float(mean.mean() - bare.mean()) / loss
             if (lost > 0).all():
