@@ -11,6 +11,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,22 @@ class Setting:
     sigmas: tuple[Fraction, ...]
     sequences: tuple[str, ...]
 
+    @property
+    def run(self) -> str:
+        """The trace's label, and that of the one whose times it takes, if it is another."""
+        return self.trace.label + ("" if self.timing is None else f" at {self.timing.label}")
+
+    def columns(self) -> dict[str, str]:
+        """What names the replay in tables."""
+        return {
+            "trace": self.trace.label,
+            "times_from": (self.timing or self.trace).label,
+            "policy": self.policy,
+            "fps": str(self.fps),
+            "latency": self.latency,
+            "scale": str(self.scale),
+        }
+
     def document(self) -> dict[str, Any]:
         """Plain values of all that the rows depend on: labels and contents of files, not paths."""
         return {
@@ -123,7 +140,7 @@ class Cell:
     cost_ns: int
     convention: str
 
-    @property
+    @cached_property
     def key(self) -> str:
         """Digest of all that the figures depend on."""
         document = {
@@ -139,16 +156,10 @@ class Cell:
 
     def about(self, metadata: Metadata) -> dict[str, str]:
         """The columns that are the same in all its rows."""
-        setting = self.setting
         return {
-            "trace": setting.trace.label,
+            **self.setting.columns(),
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
-            "times_from": (setting.timing or setting.trace).label,
-            "policy": setting.policy,
-            "fps": str(setting.fps),
-            "latency": setting.latency,
-            "scale": str(setting.scale),
             "convention": self.convention,
             "forecaster": self.forecaster,
         }
@@ -309,14 +320,13 @@ class Replayed:
     engine: str
 
 
-def replayed(setting: Setting, trace: Trace | None = None) -> Replayed:
+def replayed(setting: Setting, trace: Trace) -> Replayed:
     """Replay a setting: its sequences and repetitions at once, where that is possible.
 
     Args:
         setting: which trace, and how.
-        trace: the trace, if it has been read already.
+        trace: the setting's, as it was read.
     """
-    trace = trace or read_trace(setting.trace.path, setting.sequences or None)
     timing = None if setting.timing is None else read_trace(setting.timing.path)
     policy, _ = parse_policy(setting.policy)
     source = scaled(_source(setting), setting.scale)

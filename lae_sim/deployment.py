@@ -15,7 +15,7 @@ from lae_sim.errors import LaeError
 from lae_sim.evaluation import evaluate_groups
 from lae_sim.forecast import AnyFactory, Hold
 from lae_sim.metrics import find_convention
-from lae_sim.trace import Trace, read_trace
+from lae_sim.trace import Trace, held, read_trace
 
 STEP = Fraction(1, 100)
 MOST = 1 << 13
@@ -76,9 +76,7 @@ def slowest(search: Search) -> dict[str, Any]:
     """
     known: dict[int, float] = {}
     setting = search.cell.setting
-    trace = read_trace(setting.trace.path, setting.sequences or None)
-    if trace.frames is not None and trace.frames <= HELD:
-        trace = replace(trace, recordings=list(trace))
+    trace = held(read_trace(setting.trace.path, setting.sequences or None), HELD)
 
     def enough(step: int) -> bool:
         if step not in known:

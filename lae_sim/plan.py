@@ -140,6 +140,7 @@ def tasks(cells: Iterable[Cell], factories: Mapping[str, AnyFactory]) -> list[Ta
 def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Setting]:
     """All ways in which a trace is replayed."""
     theirs = [other.input for other in timing if _same_runs(source, other)]
+    codes = {name: _own_code(name) for name in (*study.policies, *study.latencies)}
     rates = dict.fromkeys(source.metadata.fps if fps is None else fps for fps in study.fps)
     found = []
     for times, policy, fps, latency, scale in product(
@@ -150,7 +151,7 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
         setting = Setting(
             trace=source.input,
             timing=times,
-            code=_own_code(policy) + _own_code(latency),
+            code=codes[policy] + codes[latency],
             policy=policy,
             fps=fps,
             latency=latency,

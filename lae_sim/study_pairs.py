@@ -75,8 +75,8 @@ def _pair(a: Scores, b: Scores, seed: int, resamples: int, counts: dict[int, Cou
         "convention": a.convention,
         "forecaster": a.forecaster,
         "sigma": MEAN if whole else str(setting.sigmas[0]),
-        "a": _run_label(a),
-        "b": _run_label(b),
+        "a": setting.run,
+        "b": b.setting.run,
         "sequences": count,
         "difference": float(difference.mean()),
         "difference_low": low,
@@ -98,10 +98,3 @@ def _drawn_margins(ours: Floats, theirs: Floats, counts: Counts, seed: int) -> F
             counts[:, s] / count * (run - theirs[random.integers(0, len(theirs), resamples), s])
         )
     return margins
-
-
-def _run_label(scores: Scores) -> str:
-    """The trace, and the device whose times it was replayed with, if another's."""
-    setting = scores.setting
-    own = setting.timing is None
-    return setting.trace.label + ("" if own else f" at {setting.timing.label}")  # type: ignore[union-attr]  # own

@@ -8,7 +8,7 @@ for these very sequences. Resamples depend on the seed and the number of sequenc
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -87,8 +87,7 @@ def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
     sources = {source.input: source for source in plan.sources}
     together: dict[tuple[Any, ...], list[Cell]] = {}
     for cell in plan.cells:
-        document = cell.setting.document()
-        same = str({**document, "first": 0, "count": 0})
+        same = replace(cell.setting, first=0, count=1)
         together.setdefault((same, cell.forecaster, cell.convention), []).append(cell)
     for cells in together.values():
         if all(store.has(cell) for cell in cells):
@@ -177,11 +176,9 @@ def summarise_study(
     return rows
 
 
-def _identity(scores: Scores) -> tuple[str, ...]:
+def _identity(scores: Scores) -> tuple[Any, ...]:
     """What a forecaster and hold share."""
-    setting = scores.setting
-    times = "" if setting.timing is None else setting.timing.label
-    return (setting.trace.label, times, *scores.group)
+    return (scores.setting.trace, scores.setting.timing, *scores.group)
 
 
 def _rows(
@@ -196,11 +193,7 @@ def _rows(
         "tracker": metadata.tracker,
         "dataset": metadata.dataset,
         "device": metadata.device,
-        "times_from": (setting.timing or setting.trace).label,
-        "policy": setting.policy,
-        "fps": str(setting.fps),
-        "latency": setting.latency,
-        "scale": str(setting.scale),
+        **setting.columns(),
         "convention": scores.convention,
         "forecaster": scores.forecaster,
         "sequences": len(scores.sequences),

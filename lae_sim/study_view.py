@@ -127,18 +127,12 @@ class View:
 
 def row_of(scores: Scores) -> Row:
     """What says which scores these are, as the rows of the summary say it."""
-    setting = scores.setting
     return {
-        "trace": setting.trace.label,
-        "times_from": (setting.timing or setting.trace).label,
+        **scores.setting.columns(),
         "dataset": scores.source.metadata.dataset,
-        "policy": setting.policy,
-        "fps": str(setting.fps),
-        "latency": setting.latency,
-        "scale": str(setting.scale),
         "convention": scores.convention,
         "forecaster": scores.forecaster,
-        "sigma": str(setting.sigmas[0]),
+        "sigma": str(scores.setting.sigmas[0]),
     }
 
 

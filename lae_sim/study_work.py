@@ -113,12 +113,8 @@ def told(work: Work) -> str:
 
 
 def _in_words(setting: Setting, scale: bool = True) -> str:
-    times = "" if setting.timing is None else f" at {setting.timing.label}"
     factor = f" x {setting.scale}" if scale and setting.scale != 1 else ""
-    return (
-        f"{setting.trace.label}{times}, {setting.policy}, {setting.fps} fps, "
-        f"{setting.latency}{factor}"
-    )
+    return f"{setting.run}, {setting.policy}, {setting.fps} fps, {setting.latency}{factor}"
 
 
 def cell_told(cell: Cell) -> str:

@@ -64,13 +64,13 @@ def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None =
     return Trace(metadata, replace(stored, profiled=metadata.profiled), rows)
 
 
-def held(trace: Trace) -> Trace:
-    """The trace, kept in memory from the start if it is small enough to be scored at once.
+def held(trace: Trace, frames: int = HELD_FRAMES) -> Trace:
+    """The trace, kept in memory from the start if it has at most so many world frames.
 
     Raises:
         TraceError: if it is not a valid trace.
     """
-    if trace.frames is None or trace.frames > HELD_FRAMES:
+    if trace.frames is None or trace.frames > frames:
         return trace
     return replace(trace, recordings=list(trace))
 

@@ -324,27 +324,23 @@ def test_only_what_is_missing_or_changed_is_computed(tmp_path: Path) -> None:
     assert again["mine", "hold"] == rows["synthetic-fast", "hold"] != rows["mine", "hold"]
 
 
-def test_the_code_of_an_own_forecaster_is_an_input(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "own_of_study.py").write_text(OWN)
-    path = toml(tmp_path, traces=[str(FAST)], forecasters=["own_of_study:partial"])
-    for expected in ("2 of them computed", "0 of them computed"):
-        assert expected in study_command(path, "--no-report", cwd=tmp_path)
-    (tmp_path / "own_of_study.py").write_text(OWN + "# changed\n")
-    assert "1 of them computed" in study_command(path, "--no-report", cwd=tmp_path)
-
-
-def test_the_code_of_an_own_policy_is_an_input(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("keys", "cells", "changed"),
+    [
+        ({"forecasters": ["code_of_study:partial"]}, 2, 1),
+        ({"policies": ["latest", "code_of_study:policy"]}, 4, 2),
+    ],
+)
+def test_the_code_of_a_plug_in_is_an_input(
+    keys: dict[str, Any], cells: int, changed: int, tmp_path: Path
 ) -> None:
     (tmp_path / "code_of_study.py").write_text(OWN)
-    path = toml(tmp_path, traces=[str(FAST)], policies=["latest", "code_of_study:policy"])
-    for expected in ("4 of them computed", "0 of them computed"):
-        assert expected in study_command(path, "--no-report", cwd=tmp_path)
+    path = toml(tmp_path, traces=[str(FAST)], **keys)
+    for computed in (cells, 0):
+        told = study_command(path, "--no-report", cwd=tmp_path)
+        assert f"{computed} of them computed" in told
     (tmp_path / "code_of_study.py").write_text(OWN + "# changed\n")
-    assert "2 of them computed" in study_command(path, "--no-report", cwd=tmp_path)
+    assert f"{changed} of them computed" in study_command(path, "--no-report", cwd=tmp_path)
 
 
 def test_what_is_trained_is_not_trained_again(
