@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lae_sim.report import table
-from lae_sim.timed import TimedTracker
+from lae_sim.profile.timed import TimedTracker
+from lae_sim.profile.worker import InProcess, Worker
+from lae_sim.report.table import table
 from lae_sim.trackers.protocol import Image
-from lae_sim.worker import InProcess, Worker
 
 WORK_NS = 5_000_000
 SIZES = ((640, 480), (1920, 1080))

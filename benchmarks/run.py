@@ -21,20 +21,12 @@ import numpy as np
 import simpy
 from filterpy.kalman import KalmanFilter
 
-from lae_sim import (
-    Clock,
-    Metadata,
-    Recording,
-    Trace,
-    latest,
-    simulate,
-    write_trace,
-)
-from lae_sim.examples import Examples
-from lae_sim.forecast import ForecasterFactory, Lanes, forecast, own
-from lae_sim.report import table
-from lae_sim.training import NetworkTrainer
-from lae_sim.zoo import load_forecaster
+from lae_sim import Clock, Metadata, Recording, Trace, latest, simulate, write_trace
+from lae_sim.forecast.base import ForecasterFactory, Lanes, forecast, own
+from lae_sim.learning.folds import Examples
+from lae_sim.learning.registry import load_forecaster
+from lae_sim.learning.trainers import NetworkTrainer
+from lae_sim.report.table import table
 
 SEQUENCES, FRAMES = 123, 112_578
 ELAPSED_NS = 47_000_000
@@ -270,14 +262,14 @@ def process(*arguments: str) -> Callable[[], object]:
 
 def process_lines(trace: str, rounds: int) -> list[list[str]]:
     """Whole processes, imports included, against reading the file."""
-    grid = ("-m", "lae_sim.replay", trace, "--sigma-grid", "--json", "--forecaster")
+    grid = ("-m", "lae_sim.cli.replay", trace, "--sigma-grid", "--json", "--forecaster")
     works = {
         "read the Parquet file": process("-c", READ, trace),
         "sigma = 0, hold": process(*grid[:3], "--json", "--forecaster", "hold"),
         "51 sigmas, hold": process(*grid, "hold"),
         "51 sigmas, hold + kalman": process(*grid, "hold", "kalman"),
         "51 sigmas, hold + kalman-lae-pvt": process(*grid, "hold", "kalman-lae-pvt"),
-        "--help": process("-m", "lae_sim.replay", "--help"),
+        "--help": process("-m", "lae_sim.cli.replay", "--help"),
     }
     targets = {"51 sigmas, hold": 1.0, "51 sigmas, hold + kalman": 2.0, "--help": 0.3}
     found = medians(works, rounds)

@@ -25,12 +25,13 @@ import numpy as np
 from run import CLOCK, FRAMES, lengths, medians, recordings
 
 from lae_sim import Metadata, Recording, Trace, latest, simulate, write_trace
-from lae_sim.batch import simulate_lanes
-from lae_sim.evaluation import evaluate_groups
-from lae_sim.forecast import Hold
-from lae_sim.latency import Times, bootstrap
-from lae_sim.report import table
-from lae_sim.run import replay_repeated
+from lae_sim.engine.lanes import simulate_lanes
+from lae_sim.engine.times import Times
+from lae_sim.evaluation.evaluate import evaluate_groups
+from lae_sim.forecast.base import Hold
+from lae_sim.replay.latency import bootstrap
+from lae_sim.replay.run import replay_repeated
+from lae_sim.report.table import table
 
 RATES = (15, 20, 25, 30, 40, 50, 60, 90)  # frames/s of the trackers
 REPETITIONS = 81  # 9,963 lanes
@@ -125,7 +126,7 @@ def study(
         with tempfile.TemporaryDirectory(dir=folder) as out:
             where = str(Path(out) / str(next(number)))
             return process(
-                "-m", "lae_sim.study", str(file), "--no-report", "--out", where, *options
+                "-m", "lae_sim.cli.study", str(file), "--no-report", "--out", where, *options
             )
 
     return work

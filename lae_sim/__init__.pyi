@@ -1,21 +1,28 @@
-from .batch import simulate_lanes
 from .boxes import iou
-from .clock import Clock, parse_duration, parse_fps, parse_rational
-from .comparison import World, compare_forecasters
-from .datasets import find_dataset
-from .device import describe_device
-from .drawing import draw_frame, film_strip
-from .engine import Call, Policy, Schedule, Service, simulate
+from .comparison.forecasters import compare_forecasters
+from .comparison.statistics import by_attribute, summarise
+from .datasets.frames import Dataset, ImageSequence
+from .datasets.layouts import find_dataset
+from .datasets.synthetic import synthetic_dataset
+from .engine.clock import Clock, parse_duration, parse_fps, parse_rational
+from .engine.lanes import simulate_lanes
+from .engine.policies import LanePolicy, every, fifo, latest, shrinking_tail, vot_realtime
+from .engine.scheduler import Call, Policy, Schedule, Service, simulate
+from .engine.times import Times
 from .errors import LaeError, TraceError
-from .evaluation import Answers, Evaluation, answers, evaluate
-from .events import Event, event_log
-from .forecast import ConstantVelocity, Forecaster, ForecasterFactory, Hold
-from .frames import Dataset, ImageSequence
-from .kalman import Kalman, KalmanLaePvt
-from .latency import (
+from .evaluation.evaluate import Answers, Evaluation, answers, evaluate
+from .evaluation.events import Event, event_log
+from .evaluation.metrics import CONVENTIONS, Convention, precision_curve, success_curve
+from .evaluation.pairing import SIGMA_GRID, Pairing, pair
+from .forecast.base import ConstantVelocity, Forecaster, ForecasterFactory, Hold
+from .forecast.kalman import Kalman, KalmanLaePvt
+from .learning.registry import load_forecaster
+from .profile.device import describe_device
+from .profile.live import LiveRun, run_every_frame, run_real_time
+from .profile.worker import InProcess, Worker
+from .replay.latency import (
     LatencySource,
     RandomSource,
-    Times,
     bootstrap,
     by_call,
     by_frame,
@@ -24,23 +31,17 @@ from .latency import (
     resampled,
     scaled,
 )
-from .live import LiveRun, run_every_frame, run_real_time
-from .metadata import Metadata
-from .metrics import CONVENTIONS, Convention, precision_curve, success_curve
-from .pairing import SIGMA_GRID, Pairing, pair
-from .policies import LanePolicy, every, fifo, latest, shrinking_tail, vot_realtime
-from .recording import Recording
-from .render import Scene
-from .run import Run, replay_repeated, replay_sequence, replay_trace
-from .statistics import by_attribute, comparison_table, summarise
-from .study_file import Study, read_study
-from .study_report import write_report
-from .study_run import StudyResults, run_study
-from .study_tables import write_tables
-from .synthetic import synthetic_dataset
-from .trace import Trace, read_trace, validate, write_trace
-from .worker import InProcess, Worker
-from .zoo import load_forecaster
+from .replay.run import Run, replay_repeated, replay_sequence, replay_trace
+from .replay.world import World
+from .report.film import Scene, draw_frame, film_strip
+from .report.forecasters import comparison_table
+from .report.page import write_report
+from .report.study_tables import write_tables
+from .study.run import StudyResults, run_study
+from .study.spec import Study, read_study
+from .trace.file import Trace, read_trace, validate, write_trace
+from .trace.metadata import Metadata
+from .trace.recording import Recording
 
 __version__: str
 

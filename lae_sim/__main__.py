@@ -2,6 +2,6 @@
 
 import sys
 
-from lae_sim.cli import main
+from lae_sim.cli.main import main
 
 sys.exit(main())

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
+from lae_sim._arrays import Floats
 
 PARTED_IOU = 0.5
 """Two answers for one frame that overlap less are not of the same place."""

@@ -9,12 +9,10 @@ from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from places import REPOSITORY, SHARED
 
-from lae_sim.clock import Clock
-from lae_sim.metadata import Metadata
-
-REPOSITORY = Path(__file__).resolve().parents[1]
-SHARED = REPOSITORY.parent / "shared"
+from lae_sim.engine.clock import Clock
+from lae_sim.trace.metadata import Metadata
 
 settings.register_profile(
     "lae_sim",
@@ -70,9 +68,9 @@ def learned(torch: Any) -> Any:
     """A network that a few steps have trained, on two sequences."""
     from witness import moving
 
-    from lae_sim.examples import Examples
-    from lae_sim.run import replay_sequence
-    from lae_sim.training import NetworkTrainer
+    from lae_sim.learning.folds import Examples
+    from lae_sim.learning.trainers import NetworkTrainer
+    from lae_sim.replay.run import replay_sequence
 
     recordings = [moving(60, seed, f"s{seed}") for seed in range(2)]
     runs = [replay_sequence(recording, Clock.at(Fraction(30))) for recording in recordings]

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim.frames import Image, ImageSequence
-from lae_sim.timed import Answer
+from lae_sim.datasets.frames import Image, ImageSequence
+from lae_sim.profile.timed import Answer
 
 
 def bright_frame(x: float, y: float, w: int = 12, h: int = 10, size: tuple[int, int] = (96, 64)):

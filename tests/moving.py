@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from lae_sim.frames import Image
+from lae_sim.datasets.frames import Image
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV")
 

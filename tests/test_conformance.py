@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import SHARED
+from places import SHARED
 
-from lae_sim.clock import Clock, parse_fps
-from lae_sim.evaluation import answers, evaluate
-from lae_sim.metadata import Metadata
-from lae_sim.metrics import find_convention
-from lae_sim.recording import Recording
-from lae_sim.run import Run, replay_sequence
-from lae_sim.trace import Trace, read_trace, write_trace
-from lae_sim.zoo import load_forecaster
+from lae_sim.engine.clock import Clock, parse_fps
+from lae_sim.evaluation.evaluate import answers, evaluate
+from lae_sim.evaluation.metrics import find_convention
+from lae_sim.learning.registry import load_forecaster
+from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.trace.file import Trace, read_trace, write_trace
+from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.recording import Recording
 
 CASES = sorted((SHARED / "conformance").glob("*.json"))
 

@@ -18,18 +18,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from witness import BOX, MINIMAL, TRUTH, TYPES, columns_of, moving, same, write_plain
 
-from lae_sim.clock import Clock
+from lae_sim.engine.clock import Clock
+from lae_sim.engine.policies import fifo, latest, shrinking_tail, vot_realtime
 from lae_sim.errors import LaeError, TraceError
-from lae_sim.evaluation import evaluate
-from lae_sim.forecast import Hold
-from lae_sim.kalman import Kalman, KalmanLaePvt
-from lae_sim.latency import by_call, by_frame, constant, lognormal, resampled
-from lae_sim.metadata import Metadata
-from lae_sim.pairing import SIGMA_GRID
-from lae_sim.policies import fifo, latest, shrinking_tail, vot_realtime
-from lae_sim.recording import Recording
-from lae_sim.run import replay_sequence
-from lae_sim.trace import Trace, read_trace, write_trace
+from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.forecast.base import Hold
+from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
+from lae_sim.replay.latency import by_call, by_frame, constant, lognormal, resampled
+from lae_sim.replay.run import replay_sequence
+from lae_sim.trace.file import Trace, read_trace, write_trace
+from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.recording import Recording
 
 OLD_ARROW = int(pa.__version__.split(".")[0]) < 15
 FORECASTERS = {"hold": Hold, "kalman": Kalman, "kalman-lae-pvt": KalmanLaePvt}

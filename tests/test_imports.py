@@ -9,12 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY
+from places import REPOSITORY
 from witness import moving
 
 import lae_sim
-from lae_sim.metadata import Metadata
-from lae_sim.trace import Trace, write_trace
+from lae_sim.trace.file import Trace, write_trace
+from lae_sim.trace.metadata import Metadata
 
 PACKAGE = REPOSITORY / "lae_sim"
 MODULES = sorted(

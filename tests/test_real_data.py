@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lae_sim.clock import Clock
-from lae_sim.evaluation import Evaluation, evaluate
-from lae_sim.latency import by_frame, constant, scaled
-from lae_sim.metadata import Metadata
-from lae_sim.pairing import SIGMA_GRID
-from lae_sim.recording import Recording
-from lae_sim.run import replay_sequence
-from lae_sim.study_file import Study
-from lae_sim.study_run import run_study
-from lae_sim.trace import Trace, read_trace, write_trace
-from lae_sim.zoo import load_forecaster
+from lae_sim.engine.clock import Clock
+from lae_sim.evaluation.evaluate import Evaluation, evaluate
+from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.learning.registry import load_forecaster
+from lae_sim.replay.latency import by_frame, constant, scaled
+from lae_sim.replay.run import replay_sequence
+from lae_sim.study.run import run_study
+from lae_sim.study.spec import Study
+from lae_sim.trace.file import Trace, read_trace, write_trace
+from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.recording import Recording
 
 METADATA = Metadata.new("30", "every-frame")
 CLOCK = Clock.at(Fraction(30))

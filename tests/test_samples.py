@@ -5,16 +5,15 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from places import TRACES
 
 import lae_sim
 
-TRACES = Path(__file__).parents[1] / "traces"
 SAMPLES = sorted(TRACES.glob("*.parquet"))
 VALID = sorted((TRACES / "cases" / "valid").glob("*.parquet"))
 INVALID = sorted((TRACES / "cases" / "invalid").glob("*.parquet"))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from lae_sim.forecast import Lanes, forecast
+from lae_sim.forecast.base import Lanes, forecast
 
 
 @st.composite

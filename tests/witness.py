@@ -22,8 +22,8 @@ import pyarrow.parquet as pq
 import simpy
 from hypothesis import strategies as st
 
-from lae_sim.pairing import SIGMA_GRID
-from lae_sim.recording import Recording
+from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.trace.recording import Recording
 
 with warnings.catch_warnings():
     # filterpy < 2 has unescaped backslashes in its docstrings
@@ -463,3 +463,9 @@ def same(a: Recording, b: Recording) -> bool:
         and getattr(a, field).tobytes() == getattr(b, field).tobytes()
         for field in ("truth", "boxes", "elapsed_ns", "score")
     )
+
+
+def assert_same(found: Any, expected: list[Recording]) -> None:
+    found = list(found)
+    assert [r.name for r in found] == [r.name for r in expected]
+    assert all(same(a, b) for a, b in zip(found, expected))

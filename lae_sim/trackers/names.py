@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import importlib
-import inspect
-import math
-import os
-import sys
-from typing import Any, Mapping, Sequence
+from typing import Any, Mapping
 
 from lae_sim.errors import LaeError
+from lae_sim.plugins import bound, imported
 from lae_sim.trackers.protocol import Tracker
 
 NAMES = "dcf, nanotrack, opencv:NAME, pysot, pytracking, trax:COMMAND, package.module:factory"
@@ -49,75 +46,3 @@ def make_tracker(name: str, options: Mapping[str, Any]) -> Tracker:
         raise LaeError(f"no tracker {name!r}: there are {NAMES}")
     tracker: Tracker = bound(f"tracker {name!r}", factory, positional, options)
     return tracker
-
-
-def bound(what: str, factory: Any, positional: Sequence[Any], options: Mapping[str, Any]) -> Any:
-    """Call a factory with options of a command line.
-
-    Args:
-        what: what it makes, for messages.
-        factory: any callable.
-        positional: arguments before the options.
-        options: keyword arguments.
-
-    Raises:
-        LaeError: if the factory does not take them; it says which it takes.
-    """
-    try:
-        inspect.signature(factory).bind(*positional, **options)
-    except TypeError as error:
-        raise LaeError(f"{what}: {error}; it takes {_signature(factory)}") from error
-    return factory(*positional, **options)
-
-
-def parse_options(items: Mapping[str, str]) -> dict[str, Any]:
-    """Options given as text: ``3``, ``0.5`` and ``true`` become numbers and booleans."""
-    return {name: _value(text) for name, text in items.items()}
-
-
-def _value(text: str) -> Any:
-    if text.lower() in ("true", "false"):
-        return text.lower() == "true"
-    try:
-        return int(text)
-    except ValueError:
-        pass
-    try:
-        number = float(text)
-    except ValueError:
-        return text
-    return number if math.isfinite(number) else text
-
-
-def imported(what: str, path: str) -> Any:
-    """What a user made and names as ``package.module:factory``.
-
-    Args:
-        what: what it is to be, for messages.
-        path: the module, which is also looked for in the current folder, and a name in it.
-
-    Raises:
-        LaeError: if it cannot be imported, or not be called.
-    """
-    module, _, attribute = path.partition(":")
-    here = os.getcwd()
-    if here not in sys.path:
-        sys.path.insert(0, here)
-    try:
-        factory: Any = importlib.import_module(module)
-        for part in attribute.split("."):
-            factory = getattr(factory, part)
-    except Exception as error:  # a user's module may fail in any way while it is imported
-        raise LaeError(f"{what}: {type(error).__name__}: {error}") from error
-    if not callable(factory):
-        raise LaeError(f"{what} is not callable")
-    return factory
-
-
-def _signature(factory: Any) -> str:
-    try:
-        found = inspect.signature(factory).parameters.values()
-    except (TypeError, ValueError):
-        return "other options"
-    names = [p.name for p in found if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    return ", ".join(names) or "no options"

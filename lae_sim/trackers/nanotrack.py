@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 
 from lae_sim.errors import LaeError
-from lae_sim.trackers.inputs import checked_box, checked_frame
-from lae_sim.trackers.protocol import Array, Image
+from lae_sim.trackers.protocol import Array, Image, checked_box, checked_frame
 
 TEMPLATE, SEARCH, STRIDE = 127, 255, 16  # pixels of the two inputs, and of a step of the output
 CONTEXT = 0.5

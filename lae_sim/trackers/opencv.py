@@ -12,8 +12,7 @@ from typing import Any
 import cv2
 
 from lae_sim.errors import LaeError
-from lae_sim.trackers.inputs import checked_box, checked_frame
-from lae_sim.trackers.protocol import Image
+from lae_sim.trackers.protocol import Image, checked_box, checked_frame
 
 _MAIN = {"mil": "MIL", "nano": "Nano", "vit": "Vit", "dasiamrpn": "DaSiamRPN", "goturn": "GOTURN"}
 _CONTRIB = {"csrt": "CSRT", "kcf": "KCF"}

@@ -1,8 +1,10 @@
-"""What a tracker is."""
+"""What a tracker is, what it is given and what it answers."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Optional, Protocol, Sequence, Tuple, Union
+
+from lae_sim.errors import LaeError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -12,6 +14,7 @@ if TYPE_CHECKING:
     Image = npt.NDArray[np.uint8]
 else:  # without NumPy, for quick command lines; and NumPy before 1.20 has no typing
     Array = Image = Any
+
 """A frame as OpenCV has it: uint8 [H, W, 3], blue, green, red."""
 
 Box = Sequence[float]
@@ -40,3 +43,31 @@ class Tracker(Protocol):
 
     def track(self, frame: Image) -> Output:
         """Find the target in the next frame."""
+
+
+def checked_frame(frame: Any) -> Image:
+    """The frame, contiguous in memory.
+
+    Raises:
+        LaeError: if it is not uint8 [H, W, 3] with at least one pixel.
+    """
+    import numpy as np
+
+    array = np.ascontiguousarray(frame)
+    if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3 or not array.size:
+        raise LaeError(f"a frame must be uint8 [H, W, 3], not {array.dtype} {list(array.shape)}")
+    return array
+
+
+def checked_box(box: Sequence[float]) -> tuple[float, float, float, float]:
+    """The box ``x, y, w, h`` as floats, no thinner than a pixel.
+
+    Raises:
+        LaeError: if it is not four finite numbers, or its width or height is negative.
+    """
+    import numpy as np
+
+    x, y, w, h = numbers = [float(value) for value in box]
+    if not np.isfinite(numbers).all() or w < 0 or h < 0:
+        raise LaeError(f"not a box x, y, w, h that a tracker can use: {numbers}")
+    return x, y, max(w, 1.0), max(h, 1.0)

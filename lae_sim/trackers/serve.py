@@ -1,8 +1,8 @@
 """The worker process: a tracker and its stopwatch, asked through a pipe.
 
-`lae_sim.worker.Worker` runs this file as a script, on the tracker's interpreter, with two inherited
-file descriptors: a pipe, and the memory that frames are handed over in. Questions and answers are
-JSON. Whatever the tracker prints goes to the standard error.
+`lae_sim.profile.worker.Worker` runs this file as a script, on the tracker's interpreter, with two
+inherited file descriptors: a pipe, and the memory that frames are handed over in. Questions and
+answers are JSON. Whatever the tracker prints goes to the standard error.
 """
 
 from __future__ import annotations

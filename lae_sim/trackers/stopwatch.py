@@ -63,7 +63,7 @@ class Stopwatch:
         self._limit_threads()
 
     def init(self, frame: Image, box: Sequence[float]) -> dict[str, Any]:
-        """Start on a new sequence; what is answered has the fields of `lae_sim.timed.Answer`."""
+        """Start on a new sequence; what is answered has the fields of `.timed.Answer`."""
         self._started = False
         _explained(getattr(self._tracker, "prepare", int))
         _, elapsed_ns, cpu_ns = _explained(self._timed, self._tracker.init, frame.copy(), box)

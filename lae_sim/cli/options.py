@@ -1,0 +1,198 @@
+"""The options of a replay: policies and latency sources by name."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from typing import TypeVar
+
+from lae_sim.engine.clock import parse_fps, parse_rational
+from lae_sim.errors import LaeError
+from lae_sim.replay.world import World, parse_latency, parse_policy, whole
+
+
+def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
+    """Add what decides a replay: the frame rate, the policy and the processing times.
+
+    Args:
+        parser: the command line.
+        sweeps: whether the rate and the scale of the times may be several: they are lists then,
+            that of the rates empty unless they are given.
+    """
+    add = _world_group(parser, sweeps)
+    add(
+        "--latency", default="recorded", help="where processing times come from (default: recorded)"
+    )
+    add(
+        "--latency-scale",
+        type=argument(parse_rational),
+        metavar="FACTOR",
+        **({"nargs": "+", "default": [Fraction(1)]} if sweeps else {"default": Fraction(1)}),
+        help="multiply all times by an exact factor, such as 2 or 1/3"
+        + (", or by several, one after another" if sweeps else ""),
+    )
+    add("--timing", metavar="TRACE", help="take the times from another device's trace")
+    add(
+        "--strided",
+        nargs="+",
+        default=[],
+        metavar="TRACE",
+        help="passes on every N-th frame (lae-sim profile --stride): each sequence's boxes come "
+        "from the pass that is nearest to the frames skipped",
+    )
+
+
+def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> None:
+    """Add what decides several replays, one after another.
+
+    Args:
+        parser: the command line.
+        scales: exact factors on all times, by default.
+    """
+    add = _world_group(parser)
+    add(
+        "--latency",
+        nargs="+",
+        default=["recorded"],
+        metavar="SOURCE",
+        help="processing times, one after another: recorded, constant:47ms, ... as in replay",
+    )
+    add(
+        "--latency-scale",
+        nargs="+",
+        type=argument(parse_rational),
+        default=list(scales),
+        metavar="FACTOR",
+        help="exact factors on all times, one after another "
+        f"(default: {' '.join(map(str, scales))})",
+    )
+
+
+def _world_group(
+    parser: argparse.ArgumentParser, sweeps: bool = False
+) -> Callable[..., argparse.Action]:
+    """A group of options that begins with the world's rate and the policy; what adds to it."""
+    group = parser.add_argument_group("the world and the tracker")
+    add: Callable[..., argparse.Action] = group.add_argument
+    several = (
+        "; several are a sweep of how fast the world moves, since the motion from one recorded "
+        "frame to the next stays what it is"
+    )
+    add(
+        "--fps",
+        type=argument(parse_fps),
+        **({"nargs": "+", "default": []} if sweeps else {}),
+        help="world frame rate, exact (default: the trace's)" + (several if sweeps else ""),
+    )
+    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
+    return add
+
+
+def add_forecasting(parser: argparse.ArgumentParser) -> None:
+    """Add what forecasters need: the frames of the camera's motion, and what they cost."""
+    group = parser.add_argument_group("the forecasters")
+    add = group.add_argument
+    add("--root", metavar="PATH", help="folder of the dataset's frames, for camera+NAME")
+    add("--dataset", metavar="NAME", help="the dataset in --root, if its folder does not say")
+    add(
+        "--camera-lag",
+        type=argument(whole),
+        metavar="FRAMES",
+        help="by which the camera's motion is late (default: by what estimating it takes here)",
+    )
+    add(
+        "--cost",
+        nargs="+",
+        default=[],
+        metavar="[NAME=]TIME",
+        help="what forecasting costs, such as 2ms, or measured; it delays the answers (default: 0)",
+    )
+
+
+def parse_box(text: str) -> tuple[float, ...]:
+    """A box ``x,y,w,h`` in pixels.
+
+    Raises:
+        LaeError: if the text is none.
+    """
+    try:
+        x, y, w, h = (float(value) for value in text.split(","))
+    except ValueError as error:
+        raise LaeError(f"{text!r} is not a box x,y,w,h in pixels") from error
+    return x, y, w, h
+
+
+def parse_stride(text: str) -> Fraction:
+    """A stride of a pass, such as ``2`` or ``3/2``.
+
+    Raises:
+        LaeError: if the text is none.
+    """
+    stride = parse_rational(text)
+    if not (stride > 1 and stride.numerator <= 1000):
+        raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {text!r}")
+    return stride
+
+
+Parsed = TypeVar("Parsed")
+
+
+def argument(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
+    """A parser of text as an argparse ``type``, so that its error names the option."""
+
+    def parsed(text: str) -> Parsed:
+        try:
+            return parse(text)
+        except LaeError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return parsed
+
+
+def new_parser(program: str, description: str, examples: str) -> argparse.ArgumentParser:
+    """A command line's parser, whose help ends with examples."""
+    return argparse.ArgumentParser(
+        prog=program,
+        description=description,
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def exit_status(work: Callable[[], None], program: str) -> int:
+    """Do the work of a command; its exit status is 0, 2 for an error, 130 for Ctrl-C.
+
+    An error is one or two lines on the standard error stream, without a traceback.
+    """
+    try:
+        work()
+        sys.stdout.flush()
+    except LaeError as error:
+        print(f"{program}: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader, such as head, has gone: stay silent from here on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(f"{program}: error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def parse_world(arguments: argparse.Namespace) -> World:
+    """How traces are replayed, from the arguments of :func:`lae_sim.cli.options.add_worlds`.
+
+    Raises:
+        LaeError: if there is no such policy or latency.
+    """
+    return World(
+        {name: parse_latency(name) for name in dict.fromkeys(arguments.latency)},
+        list(dict.fromkeys(arguments.latency_scale)),
+        arguments.fps,
+        parse_policy(arguments.policy)[0],
+    )

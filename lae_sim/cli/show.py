@@ -1,0 +1,60 @@
+"""``lae-sim show``: what a trace says of itself, and how its processing times are distributed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+
+from lae_sim.cli.options import exit_status
+from lae_sim.trace.describe import describe
+
+_EXAMPLES = """\
+examples:
+  lae-sim show trace.parquet
+  lae-sim show laptop.parquet jetson.parquet --plot times.png
+  lae-sim show trace.parquet --json | jq '.traces[].times.calls.p99_ms'
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``lae-sim show``; see ``--help``."""
+    parser = argparse.ArgumentParser(
+        prog="lae-sim show",
+        description="Say what a trace holds, and how its processing times are distributed.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
+    add("--json", action="store_true", help="print one JSON object instead of text")
+    add("--plot", metavar="FILE", help="draw the times (.png, .svg, .pdf)")
+    arguments = parser.parse_args(argv)
+    return exit_status(lambda: _show(arguments), "lae-sim show")
+
+
+def _show(arguments: argparse.Namespace) -> None:
+    from lae_sim import __version__
+    from lae_sim.files import check_distinct
+    from lae_sim.report.trace import overview, plot_times
+    from lae_sim.trace.file import read_trace
+    from lae_sim.trace.locate import find_traces
+
+    arguments.traces = find_traces(arguments.traces)
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="replace")  # a name may have what the terminal has not
+    if arguments.plot:
+        from lae_sim.report.figures import check_format
+
+        check_distinct([arguments.plot], arguments.traces)
+        check_format(arguments.plot)
+    found = [describe(read_trace(path), path) for path in arguments.traces]
+    reports = [report for report, _ in found]
+    if arguments.json:
+        document = {"format": "lae-show", "version": "1.0", "lae_sim": __version__}
+        print(json.dumps({**document, "traces": reports}, indent=2, allow_nan=False))
+    else:
+        print("\n\n".join(map(overview, reports)))
+    if arguments.plot:
+        plot_times(found, arguments.plot)

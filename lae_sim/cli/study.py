@@ -1,0 +1,124 @@
+"""``lae-sim study``: a folder of traces becomes the figures of a paper."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lae_sim.cli.options import argument, exit_status, new_parser
+from lae_sim.errors import LaeError
+from lae_sim.replay.world import whole
+
+if TYPE_CHECKING:
+    from lae_sim.study.run import StudyResults
+    from lae_sim.study.spec import Study
+
+PROGRAM = "lae-sim study"
+
+EXAMPLES = """\
+examples:
+  lae-sim study study.toml                                everything, on all cores of this machine
+  lae-sim study study.toml --out figures --workers 2
+  lae-sim study study.toml --scheduler tcp://head:8786    on a Dask cluster
+  lae-sim study study.toml --json | jq '.summary[] | [.trace, .forecaster, .auc]'
+
+a study file (TOML); only traces is required, and all worlds, latencies, scales, forecasters and
+conventions are crossed:
+  traces = ["traces/*.parquet"]   files, folders, globs, URLs (s3://...: pip install fsspec s3fs)
+  timing = ["jetson.parquet"]     other devices' times, for traces of their tracker and dataset
+  forecasters = ["hold", "kalman"]       as in compare
+  policies = ["latest"]                  as in replay
+  fps = ["trace", 60]                    world frame rates; "trace" is each trace's own
+  latencies = ["recorded", "bootstrap"]  also by-call, constant:47ms; bootstrap (in blocks),
+                                         resample and lognormal are drawn anew in each repetition
+  scales = [0.5, 1, 2]                   exact factors on all times; 2 is a device half as fast
+  sigma = "grid"                         0, 0.02, ..., 1 (mAUC and mDP), or a list such as [0, 0.5]
+  repetitions = 100                      of random latencies; seed = 0; block = 30 calls
+  conventions = ["pysot"]                how frames and thresholds count
+  costs = ["kalman=2ms"]                 what forecasting costs
+  sequences = ["car1"]                   these only
+  attributes = true                      in the report
+  folds = 5                              of the training of forecasters that must be trained
+  require_auc = 0.5                      look for the slowest device on which each tracker has it
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = new_parser(PROGRAM, "Replay and score traces in every way that a study names.", EXAMPLES)
+    add = made.add_argument
+    add("study", metavar="STUDY.toml", help="what to compute")
+    add(
+        "--out",
+        metavar="FOLDER",
+        help="where results go, and are looked for (default: STUDY-results)",
+    )
+    add("--workers", type=argument(lambda text: whole(text, 1)), help="processes (default: cores)")
+    add("--scheduler", metavar="ADDRESS", help="a Dask cluster to compute on, tcp://host:8786")
+    add("--no-report", action="store_true", help="write no report.html and no tables")
+    add("--json", action="store_true", help="print what study.json holds instead of tables")
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status is 1 if a part could not be computed, 2 for bad input."""
+    arguments = parser().parse_args(argv)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no worker stays behind
+    failed: list[bool] = []
+    status = exit_status(lambda: failed.append(_study(arguments)), PROGRAM)
+    if status == 130:
+        print("what is finished is kept: the same command goes on from there", file=sys.stderr)
+    return status or int(any(failed))
+
+
+def _study(arguments: argparse.Namespace) -> bool:
+    """Run the study; whether a part of it failed."""
+    import json
+
+    from lae_sim.study.spec import read_study
+
+    study = read_study(arguments.study)
+    path = Path(arguments.study)
+    folder = arguments.out or f"{path.stem}-results"
+    if arguments.workers and arguments.scheduler:
+        raise LaeError("--scheduler says where to compute: --workers is for this machine")
+    results = _run(arguments, study, folder, path.parent)
+    if not arguments.no_report:
+        from lae_sim.report.page import write_report
+        from lae_sim.report.study_tables import write_tables
+        from lae_sim.report.study_view import View
+
+        view = View(results)
+        write_tables(view, results.folder / "tables")
+        write_report(view, results.folder / "report.html")
+    else:
+        for path in [results.folder / "report.html", *(results.folder / "tables").glob("*.*")]:
+            path.unlink(missing_ok=True)  # it would be of other results
+    if arguments.json:
+        print(json.dumps(results.document(), indent=2, allow_nan=False))
+    else:
+        from lae_sim.report.study_text import study_text
+
+        print(study_text(results), end="\n\n")
+        left = sorted(path.name for path in results.folder.glob("[!.]*"))
+        print(f"{results.folder}: {', '.join(left)}")
+    return bool(results.failures)
+
+
+def _run(arguments: argparse.Namespace, study: Study, folder: str, base: Path) -> StudyResults:
+    """Run with a progress bar, if the standard error stream is a terminal."""
+    from tqdm import tqdm
+
+    from lae_sim.study.run import run_study
+
+    with tqdm(unit=" tasks", disable=None) as bar:
+
+        def progress(what: str, done: int, total: int) -> None:
+            bar.total, bar.n = total, done
+            bar.set_description(what)
+
+        return run_study(study, folder, base, arguments.workers, arguments.scheduler, progress)

@@ -1,0 +1,103 @@
+"""``lae-sim train``: train the learned forecaster on traces."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from fractions import Fraction
+from functools import partial
+
+from lae_sim.cli.options import add_worlds, argument, exit_status, new_parser
+from lae_sim.errors import LaeError
+from lae_sim.files import check_distinct, check_folders
+from lae_sim.replay.world import whole
+
+PROGRAM = "lae-sim train"
+
+EXAMPLES = """\
+examples:
+  lae-sim train traces/synthetic-slow.parquet --out forecaster.pt
+  lae-sim train DTB70-*.parquet --latency constant:20ms constant:47ms constant:100ms --out f.pt
+  lae-sim replay other.parquet --forecaster kalman learned:f.pt
+
+Scores on the sequences that it was trained on promise nothing: lae-sim compare --forecaster learned
+trains across folds, so that no sequence is scored by what has seen it.
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = new_parser(
+        PROGRAM,
+        "Train a small network to forecast, from what replays of traces ask of it.",
+        EXAMPLES,
+    )
+    add = made.add_argument
+    add("traces", nargs="+", metavar="TRACE", help="traces, better of every frame")
+    add("--out", required=True, metavar="FILE", help="the trained forecaster, such as f.pt")
+    add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
+    add("--exclude", nargs="+", default=[], metavar="NAME", help="all sequences but these")
+    add(
+        "--steps",
+        type=argument(partial(whole, least=1)),
+        default=1000,
+        metavar="N",
+        help="steps of gradient descent (default: 1000)",
+    )
+    add("--seed", type=argument(whole), default=0, help="of the training (default: 0)")
+    add("--json", action="store_true", help="print what was done as JSON")
+    add_worlds(made, [Fraction(1, 2), Fraction(1), Fraction(2)])
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status is 2 for bad input."""
+    arguments = parser().parse_args(argv)
+    return exit_status(lambda: _train(arguments), PROGRAM)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    import json
+
+    from tqdm import tqdm
+
+    from lae_sim import __version__
+    from lae_sim.cli.options import parse_world
+    from lae_sim.forecast.learned import Learned, write_learned
+    from lae_sim.learning.folds import Examples
+    from lae_sim.learning.trainers import NetworkTrainer
+    from lae_sim.trace.file import read_trace
+    from lae_sim.trace.locate import find_traces
+
+    arguments.traces = find_traces(arguments.traces)
+    check_distinct([arguments.out], arguments.traces)
+    check_folders([arguments.out])
+    world = parse_world(arguments)
+    traces = [read_trace(path, arguments.sequence) for path in arguments.traces]
+    examples = Examples.joined(
+        [Examples.of(runs) for trace in traces for *_, runs in world.replays(trace)]
+    )
+    absent = sorted(set(arguments.exclude) - set(examples.sequences))
+    if absent:
+        raise LaeError(f"--exclude {absent[0]}: there is no such sequence")
+    examples = examples.without(arguments.exclude)
+    with tqdm(total=arguments.steps, desc="training", unit=" steps", disable=None) as bar:
+        trainer = NetworkTrainer(steps=arguments.steps, progress=bar.update)
+        rule = trainer.fit(examples, arguments.seed).rule
+    made = {
+        "lae_sim": __version__,
+        "traces": arguments.traces,
+        "latencies": arguments.latency,
+        "scales": [str(scale) for scale in arguments.latency_scale],
+        "policy": arguments.policy,
+    }
+    learned = Learned(rule.network, {**rule.document, **made})
+    write_learned(learned, arguments.out)
+    if arguments.json:
+        print(json.dumps({"forecaster": arguments.out, **learned.document}, indent=2))
+        return
+    print(
+        f"{arguments.out}: trained on {len(examples.item):,} queries of "
+        f"{len(learned.trained_on)} sequences, {arguments.steps:,} steps, seed {arguments.seed}\n\n"
+        f"next:\n  lae-sim replay OTHER.parquet --forecaster kalman learned:{arguments.out}"
+    )

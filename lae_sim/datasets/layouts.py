@@ -1,0 +1,235 @@
+"""Datasets by name and folder: official layouts, plain folders of images, videos.
+
+The ground truth says which sequences there are (see ``annotations``), and each one's images are
+looked for where the official layouts have them; so no layout needs to be named.
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+from collections.abc import Callable, Iterable, Sequence
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from lae_sim._arrays import Floats
+from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
+from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
+from lae_sim.datasets.synthetic import synthetic_dataset
+from lae_sim.errors import LaeError
+
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+_FPS = {"UAV123_10fps": 10, "GOT-10k": 10}  # the others have 30
+_SPELLINGS = {"uav123@10fps": "UAV123_10fps", "got10k": "GOT-10k", "got-10k": "GOT-10k"}
+_BESIDE_TRUTH = ("img", "color", "")
+_BESIDE_ANNOTATIONS = (
+    "sequences/{}",
+    "UAV-benchmark-S/{}",
+    "data_seq/UAV123/{}",
+    "data_seq/UAV123_10fps/{}",
+    "data_seq/{}",
+    "{}/img",
+    "{}",
+)
+# The number of the first image of OTB100's sequences that start late, by name and number of
+# annotations: the benchmark's sequence configuration (https://github.com/jwlim/tracker_benchmark).
+_OTB_FIRST = {
+    ("BlurCar1", 742): 247,
+    ("BlurCar3", 357): 3,
+    ("BlurCar4", 380): 18,
+    ("David", 471): 300,
+    ("Tiger1", 349): 6,
+}
+# UAV123's clips <video>_1, <video>_2, ... share the video's images. Each starts with the last
+# image of the one before, but for these (the dataset's configSeqs.m). At 10 frames/s every third
+# image is left.
+_CLIP = re.compile(r"(.+)_([1-9])\Z")
+_CLIP_FIRST = {"bird1_2": 775, "bird1_3": 1573, "uav1_3": 2473}
+
+
+def find_dataset(
+    name: str | None = None,
+    root: str | Path | None = None,
+    sequences: Sequence[str] | None = None,
+    box: Sequence[float] | None = None,
+    fps: Fraction | None = None,
+) -> Dataset:
+    """Find a dataset's images and ground truth.
+
+    Args:
+        name: what the dataset is called, such as ``"DTB70"``; by default as its folder. It chooses
+            among several sets of annotations (UAV123 and UAV20L share a folder) and the frame
+            rate.
+        root: the dataset's folder, a folder of images, or a video file; by default the embedded
+            synthetic dataset.
+        sequences: names of those wanted; all by default.
+        box: the first box ``x, y, w, h`` in pixels, for images or a video without ground truth.
+        fps: frames per second; by default the dataset's (30, or 10 for UAV123_10fps and GOT-10k)
+            or the video's own.
+
+    Returns:
+        The dataset. Where only the first box is known, the truth after it is NaN.
+
+    Raises:
+        LaeError: if something is missing or does not fit; it says what, and where.
+    """
+    if root is None:
+        if name not in (None, "synthetic"):
+            raise LaeError(f"give the folder of {name} with --root; only synthetic needs none")
+        made = {sequence.name: sequence for sequence in synthetic_dataset().sequences}
+        chosen = _choose(sequences, made, "the synthetic dataset")
+        return Dataset("synthetic", fps or Fraction(30), [made[name] for name in chosen])
+    root = Path(root)
+    if root.is_file() or box is not None:
+        return _without_truth(name, root, sequences, box, fps)
+    name = _SPELLINGS.get((name or "").lower(), name)
+    truth = find_truth(root / "anno" / name if name and (root / "anno" / name).is_dir() else root)
+    if name is None:
+        first = next(iter(truth.files))
+        name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
+    attributes = read_attributes(truth)
+    found = [
+        _sequence(root, sequence, truth.files[sequence], attributes.get(sequence, ()))
+        for sequence in _choose(sequences, truth.files, str(root), truth.match)
+    ]
+    return Dataset(name, fps or Fraction(_FPS.get(name, 30)), found)
+
+
+def _without_truth(
+    name: str | None,
+    root: Path,
+    sequences: Sequence[str] | None,
+    box: Sequence[float] | None,
+    fps: Fraction | None,
+) -> Dataset:
+    """A video or a folder of images of which only the first box is known."""
+    sequence = root.resolve().stem if root.is_file() else root.resolve().name
+    _choose(sequences, [sequence], str(root))
+    if box is None:
+        raise LaeError(f"{root}: a video needs the target's first box: --box x,y,w,h")
+    read: Callable[[int], Image]
+    if root.is_file():
+        read = video = Video(root)
+        length, fps = len(video), fps or video.fps
+        if fps is None:
+            raise LaeError(f"{root}: does not say its frame rate; give it with --fps")
+    else:
+        if any(root.glob("groundtruth*.txt")):
+            raise LaeError(f"{root}: has ground truth; --box is for images without")
+        paths = _list_images(root / "img") or _list_images(root)
+        if not paths:
+            raise LaeError(f"{root}: no images there; --box needs a folder of images, or a video")
+        read, length = partial(_read, sequence, paths), len(paths)
+    truth = _only_first(np.array([box], np.float64), length)
+    return Dataset(name or sequence, fps or Fraction(30), [ImageSequence(sequence, truth, read)])
+
+
+def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) -> ImageSequence:
+    truth = read_truth(file)
+    paths, first = _find_images(root, name, file)
+    if len(truth) == 1:
+        truth = _only_first(truth, len(paths))
+    if len(paths) > len(truth):
+        number = first or _OTB_FIRST.get((name, len(truth)))
+        paths = _part(paths, number, len(truth), f"{paths[0].parent}, sequence {name!r}")
+    if len(paths) < len(truth):
+        raise LaeError(
+            f"sequence {name!r}: {len(paths)} images in {paths[0].parent}, but {len(truth)} "
+            f"annotations in {file}"
+        )
+    return ImageSequence(name, truth, partial(_read, name, paths), attributes)
+
+
+def _find_images(root: Path, name: str, file: Path) -> tuple[list[Path], int | None]:
+    """A sequence's images, and the number of its first one if others share the folder."""
+    home, clip = file.parent, _CLIP.match(name)
+    if file.name.startswith("groundtruth"):
+        bases, patterns, folders = [home], list(_BESIDE_TRUTH), [name]
+    else:
+        bases = [root, home, home.parent, home.parent.parent]
+        patterns, folders = list(_BESIDE_ANNOTATIONS), [name, *([clip[1]] if clip else [])]
+    for folder in folders:
+        for base, pattern in itertools.product(bases, patterns):
+            paths = _list_images(base / pattern.format(folder))
+            if paths:
+                return paths, _clip_first(file) if folder != name else None
+    looked = ", ".join(pattern.format(name) for pattern in patterns if pattern)
+    raise LaeError(
+        f"sequence {name!r}: no images found in {bases[0]}; looked in it, and in {looked}"
+    )
+
+
+def _clip_first(file: Path) -> int:
+    """The number of the first image of one of UAV123's clips, from the lengths before it."""
+    first = _CLIP_FIRST.get(file.stem)
+    if first:
+        return (first - 1) // 3 + 1 if "10fps" in file.parent.name else first
+    clip = _CLIP.match(file.stem)
+    if not clip or clip[2] == "1":
+        return 1
+    before = file.with_name(f"{clip[1]}_{int(clip[2]) - 1}.txt")
+    return _clip_first(before) + len(read_truth(before)) - 1
+
+
+def _part(paths: list[Path], first: int | None, length: int, where: str) -> list[Path]:
+    """``length`` images from number ``first``, or from the start; none may be missing between."""
+    numbers = [int("".join(re.findall("[0-9]+", path.stem)[-1:]) or -1) for path in paths]
+    if first is not None:
+        if first not in numbers:
+            raise LaeError(f"{where}: no image number {first}, where the sequence starts")
+        start = numbers.index(first)
+        paths, numbers = paths[start:], numbers[start:]
+    steps = np.diff(numbers[:length])
+    if (steps == 1).any() and (steps != 1).any():
+        gap = numbers[int(np.argmax(steps != 1))]
+        raise LaeError(f"{where}: the image after number {gap} is missing, or there twice")
+    return paths[:length]
+
+
+def _list_images(folder: Path) -> list[Path]:
+    """The images in a folder, in the order of the numbers in their names."""
+    if not folder.is_dir():
+        return []
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
+    return sorted((path for path in paths if not path.name.startswith(".")), key=_natural)
+
+
+def _natural(path: Path) -> list[str | int]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", path.name)]
+
+
+def _read(name: str, paths: list[Path], frame: int) -> Image:
+    try:
+        return read_image(paths[frame])
+    except LaeError as error:
+        raise LaeError(f"sequence {name!r}, frame {frame}: {error}") from error
+
+
+def _only_first(first: Floats, length: int) -> Floats:
+    truth = np.full((max(length, 1), 4), np.nan)
+    truth[0] = first[0]
+    return truth
+
+
+def _choose(
+    wanted: Sequence[str] | None,
+    known: Iterable[str],
+    where: str,
+    match: Callable[[str], str | None] = lambda name: None,
+) -> list[str]:
+    """The wanted names of those known, in their order; all of them if none is named."""
+    names = list(known)
+    chosen = set()
+    for name in wanted or ():
+        found = name if name in names else match(name)
+        if found is None:
+            close = difflib.get_close_matches(name, names) or names[:3]
+            raise LaeError(
+                f"{where}: no sequence {name!r} among {len(names)}; there is {', '.join(close)}"
+            )
+        chosen.add(found)
+    return [name for name in names if not wanted or name in chosen]

@@ -1,0 +1,161 @@
+"""Scheduling policies: which frame a free tracker processes next.
+
+Each is a plain function of the clock and the calls so far (see :data:`.scheduler.Policy`), or
+makes one. The last call's frame is the last one processed, the tick when it was ready is *now*, and
+``now // clock.frame_ticks`` is the newest frame that has arrived (equality counts). Those that need
+no more than these two say so by a second method, :class:`LanePolicy`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from lae_sim._arrays import Ints
+from lae_sim.engine.clock import Clock
+from lae_sim.engine.scheduler import Call, Policy
+
+
+class LanePolicy(Protocol):
+    """A policy that can also choose for many sequences at once (:mod:`lae_sim.engine.lanes`).
+
+    Its frames start at once, or at their arrival if that is still to come.
+    """
+
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        """The frame to process next and the tick to start it."""
+
+    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
+        """The frame of each lane, from its last one and the tick when that was ready.
+
+        All are int64 [lanes]. A lane that has ended may be asked about, whatever the answer.
+        """
+
+
+def _start(clock: Clock, now: int, frame: int) -> tuple[int, int]:
+    """Start ``frame`` now, or at its arrival if that is still to come."""
+    arrival = frame * clock.frame_ticks
+    return frame, now if now > arrival else arrival
+
+
+@dataclass(frozen=True)
+class _Latest:
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        last, _, now = calls[-1]
+        newest = now // clock.frame_ticks
+        if newest > last:
+            return newest, now
+        return last + 1, (last + 1) * clock.frame_ticks
+
+    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
+        following: Ints = now // clock.frame_ticks
+        return np.maximum(following, last + 1, out=following)
+
+
+@dataclass(frozen=True)
+class _Every:
+    n: int
+
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        last, _, now = calls[-1]
+        return _start(clock, now, last + self.n)
+
+    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
+        return last + min(self.n, _BEYOND)
+
+
+@dataclass(frozen=True)
+class _ShrinkingTail:
+    expected_ns: int
+
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        last, _, now = calls[-1]
+        interval = clock.frame_ticks
+        newest = now // interval
+        expected = self.expected_ns * clock.ticks_per_ns
+        waits = expected > interval and (now + expected) % interval < now % interval
+        return _start(clock, now, newest + 1 if waits else max(newest, last + 1))
+
+    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
+        interval = clock.frame_ticks
+        newest = now // interval
+        following: Ints = np.maximum(newest, last + 1)
+        expected = self.expected_ns * clock.ticks_per_ns
+        if expected > interval:  # tails shrink where adding the expected one reaches an arrival
+            waits = now - newest * interval >= interval - expected % interval
+            following = np.where(waits, newest + 1, following)
+        return following
+
+
+_BEYOND = 2**40  # no sequence has so many frames
+
+latest: LanePolicy = _Latest()
+"""The newest frame that has arrived, or the next to arrive (PVT 2021, Eqs. 3-4)."""
+
+fifo: LanePolicy = _Every(1)
+"""Every frame in order; frames queue while the tracker is busy."""
+
+
+def every(n: int) -> LanePolicy:
+    """Every ``n``-th frame in order, a fixed stride; they queue if the tracker is slower."""
+    return _Every(n)
+
+
+def shrinking_tail(expected_ns: int) -> LanePolicy:
+    """The newest frame, or the next one if waiting for it lowers the expected tail.
+
+    Li, Wang and Ramanan, "Towards Streaming Perception" (2020), Alg. 1: with the tail
+    tau(t) = t - floor(t) in frames, a tracker that becomes free at s and needs r > 1 frames waits
+    iff tau(s + r) < tau(s). A tracker that needs at most one frame interval never waits.
+
+    Args:
+        expected_ns: the expected processing time r, ns.
+    """
+    return _ShrinkingTail(expected_ns)
+
+
+def listed(frames: Sequence[int]) -> Policy:
+    """These frames in order; they queue if the tracker is slower."""
+
+    def next_listed(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        _, _, now = calls[-1]
+        beyond = len(calls) >= len(frames)
+        return _start(clock, now, frames[-1] + _BEYOND if beyond else frames[len(calls)])
+
+    return next_listed
+
+
+def vot_realtime(grace: int = 3) -> Policy:
+    """The real-time rule of the VOT toolkit, which skips frames but never scores latency.
+
+    Every call starts at its frame's arrival, as if the tracker were free. A call that takes longer
+    than the frame interval owes its overtime: while more than one interval is owed, a frame is
+    skipped and one interval repaid; what is left is forgiven. The first ``grace`` calls over time
+    owe nothing (VOT 2022: 3). The toolkit scores each output at its own frame, so evaluate such a
+    schedule with ``at_arrival=True``.
+    """
+
+    def repay_whole_frames(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        interval = clock.frame_ticks
+        last, start, ready = calls[-1]
+        overtime = ready - start - interval
+        skipped = 0
+        if overtime > interval and _late_calls(calls, interval, grace + 1) > grace:
+            skipped = -(-overtime // interval) - 1
+        following = last + 1 + skipped
+        return following, following * interval
+
+    return repay_whole_frames
+
+
+def _late_calls(calls: Sequence[Call], interval: int, most: int) -> int:
+    """How many calls took longer than a frame interval, counted up to ``most``."""
+    late = 0
+    for _, start, ready in calls:
+        late += ready - start > interval
+        if late == most:
+            break
+    return late

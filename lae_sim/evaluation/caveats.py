@@ -1,0 +1,83 @@
+"""What keeps the figures of a replay from being what their names promise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lae_sim.evaluation.evaluate import Evaluation
+from lae_sim.evaluation.metrics import Convention
+from lae_sim.forecast.base import AnyFactory, own_notes
+from lae_sim.replay.run import Run
+from lae_sim.trace.describe import STALL
+from lae_sim.trace.metadata import Metadata
+
+TRUSTED_DISAGREEMENT = 0.05
+
+
+class SkippedStalls:
+    """Counts recorded stalls that no call met, since the frame was skipped."""
+
+    def __init__(self) -> None:
+        self._count = self._longest_ns = 0
+
+    def __call__(self, run: Run) -> None:
+        """Take in a run."""
+        skipped = run.recording.elapsed_ns.copy()
+        typical = np.median(skipped[skipped >= 0])
+        skipped[run.schedule.frames] = -1
+        stalls = skipped[skipped > STALL * typical]
+        self._count += len(stalls)
+        self._longest_ns = max([self._longest_ns, *stalls.tolist()])
+
+    def notes(self) -> list[str]:
+        """A note, if there were any."""
+        if not self._count:
+            return []
+        return [
+            f"{self._count} recorded times above {STALL} times the median (the longest "
+            f"{self._longest_ns / 1e9:.3g} s) are of skipped frames; --latency by-call meets them"
+        ]
+
+
+def notes_on(
+    evaluation: Evaluation,
+    metadata: Metadata,
+    convention: Convention,
+    forecasters: Mapping[str, AnyFactory],
+    at_arrival: bool,
+) -> list[str]:
+    """What to say of the scores of a trace, a sentence each."""
+    notes = []
+    sequences = evaluation.sequences
+    bare = [n for n, i, t in zip(sequences, evaluation.frames, evaluation.truthless) if i == t]
+    if evaluation.truthless.any():
+        counted = "leaves them out" if convention.leaves_out else "counts them as missed by AUC"
+        counted += "" if convention.leaves_out else " and hit by DP"
+        notes.append(
+            f"{evaluation.truthless.sum():,} frames have no ground truth; {convention.name} "
+            + counted
+            + (f"; {len(bare)} sequences have none at all, such as {bare[0]!r}" if bare else "")
+        )
+    if evaluation.missing.any():
+        which = "the trace lacks" if evaluation.missing.all() else "some sequences lack"
+        notes.append(f"no offline score, nothing recovered: {which} the boxes of skipped frames")
+    if at_arrival:
+        notes.append("vot-realtime skips frames but never scores latency")
+    parted = np.flatnonzero(evaluation.disagreement > TRUSTED_DISAGREEMENT)
+    if len(parted):
+        worst = sequences[int(np.nanargmax(evaluation.disagreement))]
+        notes.append(
+            f"do not trust the replay of {len(parted)} of {len(sequences)} sequences, such as "
+            f"{worst!r}: the passes disagree on more than {TRUSTED_DISAGREEMENT:.0%} of its frames"
+        )
+    unknown = sum(metadata.image_size(name) is None for name in sequences)
+    if unknown and "kalman-lae-pvt" in forecasters:
+        notes.append(
+            f"kalman-lae-pvt does not clip forecasts where the image size is unknown, as it is of "
+            f"{unknown} of {len(sequences)} sequences"
+        )
+    for name, factory in forecasters.items():
+        notes += [f"{name}: {note}" for note in own_notes(factory, sequences)]
+    return notes

@@ -1,0 +1,78 @@
+"""The event log of a run: what happened, in order, at exact ticks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import NamedTuple
+
+from lae_sim.evaluation.pairing import pair
+from lae_sim.replay.run import Run
+
+KINDS = (
+    "frame arrived",
+    "processing started",
+    "frame skipped",
+    "output ready",
+    "forecaster updated",
+    "query answered",
+)
+"""Kinds of events, in the order of a frame's life."""
+
+
+class Event(NamedTuple):
+    """One event.
+
+    Attributes:
+        tick: instant in ticks of the run's clock (a query between two ticks: the tick before it).
+        kind: one of ``KINDS``.
+        frame: the world frame it is about.
+        source_frame: for a query, the frame of the output that answers it.
+    """
+
+    tick: int
+    kind: str
+    frame: int
+    source_frame: int | None = None
+
+
+def event_log(run: Run, sigma: Fraction = Fraction(0), at_arrival: bool = False) -> list[Event]:
+    """All events of a run, for queries at one permitted latency.
+
+    Within one tick frames arrive first, then come the tracker's events as it made them, then
+    queries. A frame is skipped at the moment when a newer one starts, or at the end of the stream.
+    """
+    events = [*_world(run), *_tracker(run), *_queries(run, sigma, at_arrival)]
+    return sorted(events, key=lambda event: event.tick)  # stable: each stream is in causal order
+
+
+def _world(run: Run) -> Iterator[Event]:
+    for frame in range(run.schedule.length):
+        yield Event(frame * run.schedule.clock.frame_ticks, "frame arrived", frame)
+
+
+def _tracker(run: Run) -> Iterator[Event]:
+    schedule = run.schedule
+    expected = 0
+    for frame, start, ready in zip(
+        schedule.frames.tolist(), schedule.start.tolist(), schedule.ready.tolist()
+    ):
+        yield Event(start, "processing started", frame)
+        for skipped in range(expected, frame):
+            yield Event(start, "frame skipped", skipped)
+        yield Event(ready, "output ready", frame)
+        expected = frame + 1
+    for skipped in range(expected, schedule.length):
+        yield Event(schedule.length * schedule.clock.frame_ticks, "frame skipped", skipped)
+
+
+def _queries(run: Run, sigma: Fraction, at_arrival: bool) -> Iterator[Event]:
+    pairing = pair([run.schedule], [sigma], at_arrival)
+    interval = run.schedule.clock.frame_ticks
+    spans = zip(pairing.frames.tolist(), pairing.first[:, 0].tolist(), pairing.end[:, 0].tolist())
+    for source, first, end in spans:
+        for frame in range(first, end):
+            tick = int((frame + sigma) * interval // 1)
+            if frame == first and source > 0:
+                yield Event(tick, "forecaster updated", source)
+            yield Event(tick, "query answered", frame, source)

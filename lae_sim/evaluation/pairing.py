@@ -1,0 +1,320 @@
+"""Pairing: which output answers each query, for any set of permitted latencies at once.
+
+The query for world frame i happens at (i + sigma) / fps; its answer is the latest output that is
+ready by then, equality counts (PVT 2021, Eq. 5; sigma is from PVT++ 2023). With every sigma a
+multiple of 1/b frames, an output ready at tick t is visible at query (i, m/b) iff K <= b*i + m,
+where K = ceil(b*t / frame_ticks) is its *step*: all is integer from there on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import lcm
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim._arrays import Bools, Ints
+from lae_sim.engine.clock import MAX_INT64
+from lae_sim.engine.scheduler import Schedule
+from lae_sim.errors import LaeError
+
+SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
+"""The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames."""
+
+MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
+_NEVER = 2**62
+_WIDE = 8  # from so many sigmas on, reduceat is slower than a loop over the sequences
+_CELLS = 1 << 17  # outputs x sigmas at once, so that they stay in the cache
+Frames = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Who answers whom in some sequences, for some permitted latencies.
+
+    The n outputs of all sequences stand one after another; M is the number of sigmas.
+
+    Attributes:
+        lengths: world frames of each sequence, int64 [S].
+        offsets: first output of each sequence, and n: int64 [S + 1].
+        frames: source frame of each output, int64 [n].
+        steps: step from which each output is visible, int64 [n]; hugely negative for the first
+            of a sequence, since the initial box is always there.
+        next_steps: step of the output after it, int64 [n]; huge for the last of a sequence.
+        scale: b, steps per frame.
+        sigmas: m for each permitted latency m/b, ascending, int64 [M].
+        first: first world frame that each output answers, int32 [n, M].
+        end: the frame after the last one it answers, int32 [n, M]; equal to ``first`` if it
+            answers none.
+    """
+
+    lengths: Ints
+    offsets: Ints
+    frames: Ints
+    steps: Ints
+    next_steps: Ints
+    scale: int
+    sigmas: Ints
+    first: Frames
+    end: Frames
+
+    @property
+    def mismatch_sum(self) -> Ints:
+        """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""
+        if len(self.sigmas) < _WIDE:
+            answered = self.end - self.first
+            source_sum = np.add.reduceat(answered * self.frames[:, None], self.offsets[:-1])
+        else:
+            source_sum = np.stack(
+                [self.frames[s] @ (self.end[s] - self.first[s]) for s in self._spans()]
+            )
+        return (self.lengths * (self.lengths - 1) // 2)[:, None] - source_sum
+
+    @property
+    def mismatch_max(self) -> Ints:
+        """Largest i - psi(i) of each sequence, frames, int64 [S, M]."""
+        # An output that answers nothing cannot have the maximum: the query before its turn was
+        # answered by an older one.
+        return self._largest_gap((self.frames + 1).astype(np.int32)[:, None])
+
+    @property
+    def longest_hold(self) -> Ints:
+        """Most queries in a row that one output answered, frames, int64 [S, M]."""
+        return self._largest_gap(self.first)
+
+    def _largest_gap(self, begin: Frames) -> Ints:
+        """The largest distance of ``end`` from another frame in each sequence, int64 [S, M]."""
+        if len(self.sigmas) < _WIDE:
+            return np.maximum.reduceat(self.end - begin, self.offsets[:-1]).astype(np.int64)
+        largest = [(self.end[span] - begin[span]).max(axis=0) for span in self._spans()]
+        return np.stack(largest).astype(np.int64)
+
+    def _spans(self) -> Iterator[slice]:
+        """The outputs of each sequence: few enough that what is made of them stays in the cache."""
+        return map(slice, self.offsets[:-1].tolist(), self.offsets[1:].tolist())
+
+
+def pair(
+    schedules: Sequence[Schedule],
+    sigmas: Sequence[Fraction],
+    at_arrival: bool = False,
+    cost_ns: int = 0,
+) -> Pairing:
+    """Pair the outputs of some sequences with their queries.
+
+    Args:
+        schedules: one per sequence, all of one clock.
+        sigmas: distinct permitted latencies in frames, ascending.
+        at_arrival: let each output count from its own frame's arrival, as the VOT toolkit scores;
+            latency then plays no part.
+        cost_ns: what an answer costs to make of an output; it delays all but the initial box.
+
+    Raises:
+        LaeError: if the clocks differ, calls overlap, the sigmas are not ascending, or they or the
+            cost are too fine or too large for 64-bit integers.
+    """
+    if not all(isinstance(sigma, (Fraction, int)) for sigma in sigmas):
+        raise LaeError("permitted latencies must be exact: Fraction(1, 2), not 0.5")
+    if not sigmas or list(sigmas) != sorted(set(sigmas)):
+        raise LaeError("permitted latencies must be ascending, each of them once")
+    if len({schedule.clock for schedule in schedules}) != 1:
+        raise LaeError("sequences of different frame rates cannot be paired together")
+    scale = lcm(*(sigma.denominator for sigma in sigmas))
+    numerators = [int(sigma * scale) for sigma in sigmas]
+    interval = schedules[0].clock.frame_ticks
+    lengths = np.array([schedule.length for schedule in schedules], np.int64)
+    if cost_ns < 0:
+        raise LaeError(f"forecasting cannot cost {cost_ns} ns, less than nothing")
+    cost = cost_ns * schedules[0].clock.ticks_per_ns
+    last_ready = max(int(schedule.ready[-1]) for schedule in schedules) + cost
+    if last_ready > MAX_INT64:
+        raise LaeError(f"forecasting cannot cost {cost_ns:g} ns: the clock ends before")
+    largest = max(last_ready // interval, int(lengths.max())) * scale
+    most_sigma = max(map(abs, numerators))
+    if max(scale * interval, largest + most_sigma) >= _NEVER or most_sigma > MOST_FRAMES * scale:
+        raise LaeError(
+            f"the permitted latencies {', '.join(map(str, sigmas[:3]))}... are too fine or too "
+            "large for exact 64-bit arithmetic: use fewer digits"
+        )
+    counts = [len(schedule.frames) for schedule in schedules]
+    offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    frames = np.concatenate([schedule.frames for schedule in schedules])
+    if at_arrival:
+        steps = frames * scale
+    elif any((s.start[1:] < s.ready[:-1]).any() for s in schedules):
+        raise LaeError(
+            "calls overlap, as under the rule of VOT, which never scores latency: score such a "
+            "schedule with at_arrival=True"
+        )
+    else:
+        frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]) + cost, interval)
+        steps = frame * scale - (-rest * scale // interval)
+    steps[offsets[:-1]] = -_NEVER
+    next_steps = np.append(steps[1:], _NEVER)
+    next_steps[offsets[1:] - 1] = _NEVER
+    m = np.array(numerators, np.int64)
+    first = _first_visible(steps, m, scale, np.repeat(lengths, counts))
+    end = np.empty_like(first)
+    end[:-1] = first[1:]
+    end[offsets[1:] - 1] = lengths[:, None]
+    return Pairing(lengths, offsets, frames, steps, next_steps, scale, m, first, end)
+
+
+def _first_visible(steps: Ints, sigmas: Ints, scale: int, lengths: Ints) -> Frames:
+    """ceil((K - m) / b), within 0..T, for each output and sigma; without a division for each."""
+    frame, rest = np.divmod(steps, scale)
+    whole, part = np.divmod(sigmas, scale)
+    frame = np.clip(frame, -MOST_FRAMES, MOST_FRAMES).astype(np.int32)[:, None]
+    rest, whole, limit = rest[:, None], whole.astype(np.int32), lengths.astype(np.int32)[:, None]
+    first = np.empty((len(steps), len(sigmas)), np.int32)
+    rows = max(_CELLS // len(sigmas), 1)
+    for begin in range(0, len(steps), rows):
+        now = slice(begin, begin + rows)
+        some = np.subtract(frame[now], whole, out=first[now])
+        some += rest[now] > part
+        np.maximum(some, 0, out=some)
+        np.minimum(some, limit[now], out=some)
+    return first
+
+
+@dataclass(frozen=True)
+class Histories:
+    """What forecasters were fed: the outputs answered with, where sigmas that agree share.
+
+    Attributes:
+        sequence: the sequence of each history, int64 [L].
+        sigma_from, sigma_to: the range of sigmas that share it, int64 [L].
+        offsets: first item of each history, and N: int64 [L + 1].
+        output: the output of each item, int64 [N]; the first of a history is the initial box.
+    """
+
+    sequence: Ints
+    sigma_from: Ints
+    sigma_to: Ints
+    offsets: Ints
+    output: Ints
+
+    def parts(self, items: int) -> Iterator[Histories]:
+        """The same in parts of whole sequences, of at most so many items if one has no more.
+
+        Sequences of similar size go together, and ascend in each part.
+        """
+        sequences, lanes = np.unique(self.sequence, return_counts=True)
+        lane_sizes = np.diff(self.offsets)
+        sizes = np.bincount(self.sequence, lane_sizes)[sequences].astype(np.int64)
+        largest = np.argsort(-sizes // lanes, kind="stable")
+        part: list[int] = []
+        total = 0
+        for s, size in zip(largest.tolist(), sizes[largest].tolist()):
+            if part and total + size > items:
+                yield self._part(np.isin(self.sequence, sequences[part]))
+                part, total = [], 0
+            part.append(s)
+            total += size
+        yield self._part(np.isin(self.sequence, sequences[part]))
+
+    def _part(self, those: Bools) -> Histories:
+        if those.all():
+            return self
+        sizes = np.diff(self.offsets)
+        return Histories(
+            self.sequence[those],
+            self.sigma_from[those],
+            self.sigma_to[those],
+            np.concatenate([[0], np.cumsum(sizes[those])]),
+            self.output[np.repeat(those, sizes)],
+        )
+
+
+def histories(pairing: Pairing, memoryless: bool = False) -> Histories:
+    """The outputs that a forecaster is fed in each sequence, per sigma.
+
+    An output overtaken between two queries is never used. With ``memoryless``, for forecasters that
+    look at the latest output alone, one history of all outputs serves every sigma.
+    """
+    count = len(pairing.sigmas)
+    used = pairing.end > pairing.first
+    used[pairing.offsets[:-1]] = True  # every forecaster starts from the initial box
+    begins = np.zeros((len(pairing.lengths), count), np.bool_)
+    begins[:, 0] = True
+    if memoryless:
+        used[:] = True
+    elif count > 1:
+        begins[:, 1:] = np.logical_or.reduceat(used[:, 1:] != used[:, :-1], pairing.offsets[:-1])
+    sequence, sigma_from = np.nonzero(begins)
+    sigma_to = np.append(sigma_from[1:], 0)
+    sigma_to[sigma_to == 0] = count
+    sizes = np.diff(pairing.offsets)[sequence]
+    output = ranges(pairing.offsets[sequence], sizes)
+    history = np.repeat(np.arange(len(sequence)), sizes)
+    kept = used[output, sigma_from[history]]
+    items = np.bincount(history[kept], minlength=len(sequence))
+    offsets = np.concatenate([[0], np.cumsum(items)])
+    return Histories(sequence, sigma_from, sigma_to, offsets, output[kept])
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Each (world frame, history item) that some sigma pairs, once.
+
+    Attributes:
+        item: index into the histories' items, int64 [P], not decreasing.
+        frame: world frame i, int64 [P].
+        sigma_from, sigma_to: the range of sigmas that pair them, int64 [P].
+    """
+
+    item: Ints
+    frame: Ints
+    sigma_from: Ints
+    sigma_to: Ints
+
+    def some(self, those: Any) -> Pairs:
+        """Some of them."""
+        columns = (self.item, self.frame, self.sigma_from, self.sigma_to)
+        return Pairs(*(column[those] for column in columns))
+
+
+def pairs(pairing: Pairing, fed: Histories) -> Pairs:
+    """List the distinct pairs of frames and outputs, with the sigmas each is for."""
+    sizes = np.diff(fed.offsets)
+    low, high = np.repeat(fed.sigma_from, sizes), np.repeat(fed.sigma_to, sizes)
+    count = len(pairing.sigmas)
+    cell = fed.output * count
+    begin = pairing.first.take(cell + high - 1).astype(np.int64)
+    sizes = np.maximum(pairing.end.take(cell + low) - begin, 0)
+    item = np.repeat(np.arange(len(low)), sizes)
+    frame = ranges(begin, sizes)
+    found = Pairs(item, frame, low.take(item), high.take(item))
+    # a history of one sigma has no other pairs
+    several = np.flatnonzero(found.sigma_to - found.sigma_from > 1)
+    if not len(several):
+        return found
+    output = fed.output.take(item.take(several))
+    query = pairing.scale * frame.take(several)
+    for ends, steps, limit in (
+        (found.sigma_from, pairing.steps, np.maximum),
+        (found.sigma_to, pairing.next_steps, np.minimum),
+    ):
+        seen = _place(pairing.sigmas, steps.take(output) - query)
+        ends[several] = limit(seen, ends.take(several))
+    some = found.sigma_from < found.sigma_to
+    return found if some.all() else found.some(some)
+
+
+def _place(sigmas: Ints, values: Ints) -> Ints:
+    """How many sigmas are below each value."""
+    if sigmas[-1] - sigmas[0] == len(sigmas) - 1:  # one after another, as on the usual grid
+        place: Ints = np.clip(values - sigmas[0], 0, len(sigmas))
+        return place
+    return np.searchsorted(sigmas, values)
+
+
+def ranges(starts: Ints, sizes: Ints) -> Ints:
+    """``sizes[0]`` integers from ``starts[0]`` on, then ``sizes[1]`` from ``starts[1]``, ..."""
+    ends = np.cumsum(sizes)
+    joined: Ints = np.arange(ends[-1] if len(ends) else 0) + np.repeat(starts - ends + sizes, sizes)
+    return joined

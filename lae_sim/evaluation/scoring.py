@@ -1,0 +1,167 @@
+"""Scoring answers: shares of frames and curves, for any number of permitted latencies at once.
+
+Each distinct pair of a world frame and an output is scored once, and its counts are added over the
+range of sigmas that it answers by difference arrays; counts are whole numbers, so that no order of
+summation changes a result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lae_sim._arrays import Floats, Ints
+from lae_sim.evaluation.metrics import (
+    CENTRE_THRESHOLDS,
+    METRICS,
+    NORM_THRESHOLDS,
+    Convention,
+    FrameCounts,
+    frame_counts,
+)
+from lae_sim.evaluation.pairing import Histories, Pairs, ranges
+from lae_sim.trace.recording import Recording
+
+_CHUNK = 1 << 14  # pairs at once: what is made of them stays in the cache
+_EXACT = 52  # bits of whole numbers that float64 holds, with one to spare
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """One forecaster's part of a :class:`.evaluate.Evaluation`: without its axis F."""
+
+    scores: Mapping[str, Floats]
+    failure: Ints
+    success: Floats
+    precision: Floats
+
+
+class Scorer:
+    """Scores answers for some recordings against their truth."""
+
+    def __init__(self, recordings: Sequence[Recording], convention: Convention) -> None:
+        self._convention = convention
+        self._lengths = np.array([len(recording) for recording in recordings], np.int64)
+        self._bases = np.cumsum(self._lengths) - self._lengths
+        self._truth = _columns([recording.truth for recording in recordings])
+        self._boxes = _columns([recording.boxes for recording in recordings])
+        counted = self._lengths
+        if convention.leaves_out:
+            valid = convention.valid_success(self._truth.T)
+            counted = np.add.reduceat(valid.astype(np.int64), self._bases)
+        self._counted = np.where(counted > 0, counted, np.nan)
+
+    def of(self, parts: Iterable[tuple[Histories, Pairs, Floats]], count: int) -> Scored:
+        """Score paired answers for so many sigmas."""
+        return self._scored(
+            (
+                (np.repeat(fed.sequence, np.diff(fed.offsets)).take(found.item), found, boxes)
+                for fed, found, boxes in parts
+            ),
+            count,
+        )
+
+    def offline(self) -> Scored:
+        """Score every frame's own box; NaN for sequences that lack some."""
+        sequence = np.repeat(np.arange(len(self._bases)), self._lengths)
+        frame = np.arange(len(sequence)) - self._bases[sequence]
+        none = np.zeros_like(frame)
+        scored = self._scored([(sequence, Pairs(frame, frame, none, none + 1), self._boxes.T)], 1)
+        missing = np.add.reduceat(np.isnan(self._boxes[0]).astype(np.int64), self._bases) > 0
+        for values in (*scored.scores.values(), scored.success, scored.precision):
+            values[missing] = np.nan
+        return scored
+
+    def _scored(self, parts: Iterable[tuple[Ints, Pairs, Floats]], count: int) -> Scored:
+        """Score answers, each part with the sequence of each pair, int64 [P]."""
+        tally = _Tally(self._lengths, count, self._convention.thresholds)
+        for sequence, found, boxes in parts:
+            for begin in range(0, len(boxes), _CHUNK):
+                now = slice(begin, begin + _CHUNK)
+                some = found.some(now)
+                truth = self._truth.take(self._bases[sequence[now]] + some.frame, axis=1).T
+                counts = frame_counts(truth, boxes[now], some.frame, self._convention)
+                tally.add(sequence[now], some, counts)
+        thresholds = {"auc": self._convention.thresholds, "norm_auc": len(NORM_THRESHOLDS)}
+        counted = self._counted[:, None]
+        scores = {m: tally.sums[m] / (counted * thresholds.get(m, 1)) for m in METRICS}
+        success, precision = tally.success / counted, tally.precision / counted
+        if self._convention.drops_zeros:
+            bests = ("auc", "within50", "norm_auc", "norm_auc")
+            for metric, best in zip(METRICS, bests):
+                scores[metric] = np.where(tally.sums[best] > 0, scores[metric], np.nan)
+            success[np.isnan(scores["auc"][:, 0])] = np.nan
+            precision[np.isnan(scores["dp20"][:, 0])] = np.nan
+        return Scored(scores, tally.failure, success, precision)
+
+
+class _Tally:
+    """Sums of what pairs count, by sequence and sigma."""
+
+    def __init__(self, lengths: Ints, count: int, thresholds: int) -> None:
+        self._count, self._sequences = count, len(lengths)
+        names = (*METRICS, "within50")
+        self.sums = {name: np.zeros((len(lengths), count), np.int64) for name in names}
+        self.failure = np.repeat(lengths[:, None], count, axis=1)
+        self.success = np.zeros((len(lengths), thresholds))
+        self.precision = np.zeros((len(lengths), len(CENTRE_THRESHOLDS)))
+
+    def add(self, sequence: Ints, found: Pairs, counts: FrameCounts) -> None:
+        """Add at most ``_CHUNK`` pairs, whose frames ascend in each sequence at each sigma."""
+        here = sequence[np.diff(sequence, prepend=-1) != 0]  # each once: they ascend
+        rank = np.zeros(here[-1] + 1, np.int64)
+        rank[here] = np.arange(len(here))
+        local, width = rank.take(sequence), self._count + 1
+        begin, end = local * width + found.sigma_from, local * width + found.sigma_to
+        size = len(here) * width
+        kinds: tuple[dict[str, Any], ...] = (
+            {"auc": counts.success, "norm_auc": counts.norm},
+            {"dp20": counts.dp, "norm_dp20": counts.norm_dp, "within50": counts.within50},
+        )
+        for packed in kinds:
+            bits = _EXACT // len(packed)  # a chunk's sum of 101 thresholds takes 21, of flags 15
+            values = np.zeros(len(begin))
+            for k, each in enumerate(packed.values()):
+                values += each * 2.0 ** (k * bits)
+            steps = np.bincount(begin, values, size) - np.bincount(end, values, size)
+            sums = steps.reshape(-1, width).cumsum(axis=1)[:, : self._count].astype(np.int64)
+            for name in packed:
+                self.sums[name][here] += sums & (1 << bits) - 1
+                sums >>= bits
+        first = np.flatnonzero(found.sigma_from == 0)
+        of_first = local.take(first)
+        for curves, passed in (
+            (self.success, counts.success),
+            (self.precision[:, ::-1], counts.precision),
+        ):
+            shape = len(here), curves.shape[1]
+            curves[here] += _above(of_first, passed.take(first).astype(np.int64), *shape)
+        self._note_failures(sequence, found, np.flatnonzero(counts.apart))
+
+    def _note_failures(self, sequence: Ints, found: Pairs, lost: Ints) -> None:
+        """Note the first pair of each sequence and sigma that is lost."""
+        begin = sequence[lost] * self._count + found.sigma_from[lost]
+        sizes = found.sigma_to[lost] - found.sigma_from[lost]
+        # of losses in a row, in which one or two outputs answer each frame, the first will do
+        new = np.ones(len(lost), np.bool_)
+        for back in (1, 2):
+            new[back:] &= (begin[back:] != begin[:-back]) | (sizes[back:] != sizes[:-back])
+        begin, sizes, lost = begin[new], sizes[new], lost[new]
+        at = ranges(begin, sizes)
+        np.minimum.at(self.failure.reshape(-1), at, np.repeat(found.frame[lost], sizes))
+
+
+def _columns(boxes: Sequence[Floats]) -> Floats:
+    """The columns of boxes one after another, float64 [4, n], each in one piece."""
+    return np.ascontiguousarray(np.concatenate(boxes).T)
+
+
+def _above(sequence: Ints, passed: Ints, sequences: int, most: int) -> Ints:
+    """How many frames passed more than 0, 1, ..., ``most`` - 1 thresholds, int64 [S, most]."""
+    width = most + 1
+    counts = np.bincount(sequence * width + passed, minlength=sequences * width)
+    above: Ints = counts.reshape(-1, width)[:, :0:-1].cumsum(axis=1)[:, ::-1]
+    return above

@@ -1,0 +1,327 @@
+"""Results of other toolkits on every frame: GOT-10k toolkit, pytracking, OPE text, MATLAB, npz.
+
+Each reader gives the boxes and, where the files have them, the times. Real-time runs are read by
+:mod:`lae_sim.importers.lae_pvt`.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile, ZipFile
+
+import numpy as np
+
+from lae_sim._arrays import Floats, Ints
+from lae_sim.datasets.numbers import read_durations, read_numbers
+from lae_sim.engine.clock import parse_duration, parse_fps
+from lae_sim.errors import LaeError
+from lae_sim.importers.matlab import load_matlab
+
+FORMATS = ("got10k", "pytracking", "ope", "mat", "npz", "lae-pvt")
+
+NO_TIMES = "give --time constant:47ms, --time mean-fps:120 or --time mean-fps:FILE.csv"
+
+_SUFFIXES = {".npz": "npz", ".mat": "mat", ".pkl": "lae-pvt", ".pickle": "lae-pvt"}
+# What toolkits write beside the boxes.
+_NOT_BOXES = ("_time", "_all_boxes", "_all_scores", "_scores", "_confidence", "_conf")
+_MAX_NPZ_BYTES = 1 << 31
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the results of one sequence lie.
+
+    Attributes:
+        name: the sequence as the files call it.
+        path: the file of boxes.
+        times: the file of measured times, if there is one.
+    """
+
+    name: str
+    path: Path
+    times: Path | None = None
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a tracker did on every frame of one sequence.
+
+    Attributes:
+        boxes: ``x, y, w, h`` in pixels, float64 [n, 4].
+        elapsed_ns: measured times in ns, int64 [n], if there are any.
+        mean_fps: mean frames per second, where the file says only that.
+    """
+
+    boxes: Floats
+    elapsed_ns: Ints | None = None
+    mean_fps: Fraction | None = None
+
+
+@dataclass(frozen=True)
+class GivenTimes:
+    """Processing times that were not measured per frame.
+
+    Attributes:
+        source: what the trace says of them.
+        constant_ns: one time for all, or None.
+        per_sequence: frames (if stated) and time in ns of each sequence.
+    """
+
+    source: str
+    constant_ns: int | None
+    per_sequence: Mapping[str, tuple[int | None, int]]
+
+    def of(self, sequence: str, frames: int) -> int:
+        """The time of every frame of a sequence of ``frames`` frames, ns.
+
+        Raises:
+            LaeError: if it is not there, or is that of another number of frames.
+        """
+        if self.constant_ns is not None:
+            return self.constant_ns
+        if sequence not in self.per_sequence:
+            raise LaeError(f"{self.source}: no row for sequence {sequence!r}")
+        stated, elapsed_ns = self.per_sequence[sequence]
+        if stated not in (None, frames):
+            raise LaeError(
+                f"{self.source}: sequence {sequence!r} has {stated} frames there and {frames} here"
+            )
+        return elapsed_ns
+
+
+def given_times(text: str, tracker: str) -> GivenTimes | None:
+    """Times by the names that command lines use; None means the measured ones.
+
+    Args:
+        text: ``measured``, ``constant:47ms``, ``mean-fps:120`` or ``mean-fps:FILE.csv`` (columns
+            sequence, fps and perhaps tracker, frames).
+        tracker: whose rows to take where the file has several trackers.
+
+    Raises:
+        LaeError: if there is no such name, or the file lacks the tracker or a column.
+    """
+    name, _, value = text.partition(":")
+    if text == "measured":
+        return None
+    if name == "constant":
+        amount = re.sub(r"(?<=\d)(?=[a-z])", " ", value)
+        return GivenTimes(f"constant {amount}, not measured", parse_duration(value), {})
+    if name != "mean-fps":
+        raise LaeError(f"no time {text[:40]!r}: use the measured ones, or {NO_TIMES}")
+    if not value.lower().endswith(".csv"):
+        source = f"mean fps {value} given, not measured per frame"
+        return GivenTimes(source, frame_ns(parse_fps(value)), {})
+    source = f"mean fps of each sequence from {Path(value).name}, not measured per frame"
+    return GivenTimes(source, None, dict(_mean_fps_rows(Path(value), tracker)))
+
+
+def frame_ns(fps: Fraction) -> int:
+    """The time of one frame at a mean rate, ns, rounded half to even."""
+    return round(10**9 / fps)
+
+
+def find_results(path: Path, wanted: str = "auto", repetition: int = 1) -> tuple[str, list[Source]]:
+    """Find the results files of one tracker.
+
+    Args:
+        path: the tracker's folder, or the file of one sequence, or an ``.npz`` of all.
+        wanted: a name of ``FORMATS``, or ``"auto"``.
+        repetition: which run to take where the toolkit repeats them, from 1.
+
+    Returns:
+        The format, and the sources sorted by name.
+
+    Raises:
+        LaeError: if there are no results, results of several formats, or none of the one wanted.
+    """
+    if not path.exists():
+        raise LaeError(f"{path}: no such file or folder of results")
+    found = _by_format(path, repetition)
+    if wanted != "auto":
+        kind = "text" if wanted in ("got10k", "pytracking", "ope") else wanted
+        found = {kind: found[kind]} if kind in found else {}
+    if not found:
+        raise LaeError(
+            f"{path}: no results found{'' if wanted == 'auto' else f' of format {wanted}'}; looked "
+            "for <seq>.txt, <seq>/<seq>_001.txt, .mat, .npz and .pkl files; give the folder of "
+            "one tracker"
+        )
+    if len(found) > 1:
+        raise LaeError(f"{path}: holds {' and '.join(found)} results; say which with --format")
+    [(kind, sources)] = found.items()
+    if kind == "text":
+        kind = wanted if wanted != "auto" else _text_format(sources)
+    return kind, sorted(sources, key=lambda source: source.name)
+
+
+def read_results(
+    kind: str, source: Source, repetition: int, unit: str | None, measured: bool
+) -> Results:
+    """Read one sequence.
+
+    Args:
+        kind: a name of ``FORMATS``, but not ``"lae-pvt"``.
+        source: its files.
+        repetition: which run to take where the files repeat them, from 1.
+        unit: of the measured times (see :func:`lae_sim.datasets.numbers.read_durations`).
+        measured: whether measured times are to be read.
+
+    Raises:
+        LaeError: if a file is damaged or is not of the format.
+    """
+    if kind == "mat":
+        return read_mat(source.path)
+    if kind == "npz":
+        return Results(_npz_boxes(source.path, source.name))
+    boxes = _checked_boxes(read_numbers(source.path), str(source.path))
+    if source.times is None or not measured or kind == "ope":
+        return Results(boxes)
+    return Results(boxes, read_durations(source.times, unit, repetition - 1))
+
+
+def read_mat(path: Path) -> Results:
+    """Read a MATLAB result: ``res`` [n, 4] and ``fps``, alone or in ``results`` as OTB has them.
+
+    Raises:
+        LaeError: if the file is not of version 5 to 7, or lacks a field.
+    """
+    content = load_matlab(path)
+    run = content.get("results", content)
+    if isinstance(run, list):
+        if len(run) != 1:
+            raise LaeError(f"{path}: holds {len(run)} runs (SRE or TRE?), and one pass is needed")
+        run = run[0]
+    if not isinstance(run, Mapping) or "res" not in run:
+        raise LaeError(f"{path}: no field 'res' (boxes x, y, w, h)")
+    if run.get("type", "rect") != "rect":
+        raise LaeError(f"{path}: boxes of type {str(run['type'])[:40]!r}; only 'rect' is known")
+    boxes = _checked_boxes(run["res"], str(path))
+    stated, fps = _scalar(run.get("len")), _scalar(run.get("fps"))
+    if stated not in (None, len(boxes)):
+        raise LaeError(f"{path}: field 'len' is {stated:g}, and 'res' has {len(boxes)} rows")
+    if fps is not None and math.isfinite(fps) and fps > 0:
+        return Results(boxes, mean_fps=Fraction(fps))
+    return Results(boxes)
+
+
+def tracker_name(kind: str, path: Path, matched: Mapping[str, Source]) -> str:
+    """The tracker's name as its results tell it.
+
+    Args:
+        kind: a name of ``FORMATS``.
+        path: of the results.
+        matched: the source of each sequence.
+    """
+    if kind == "npz":
+        return path.stem
+    if kind == "mat":  # <seq>_<tracker>.mat
+        tails = {source.name[len(name) :].strip("_") for name, source in matched.items()}
+        if len(tails) == 1 and tails != {""}:
+            return tails.pop()
+    folder = path.resolve()
+    return folder.parent.name if folder.is_file() else folder.name
+
+
+def _scalar(value: Any) -> float | None:
+    return float(value.item()) if isinstance(value, np.ndarray) and value.size == 1 else None
+
+
+def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | None, int]]]:
+    """Sequence, frames (if stated) and time in ns of each row of a table of mean fps."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, ValueError, csv.Error) as error:
+        raise LaeError(f"{path}: cannot be read: {error}") from error
+    if not rows or not {"sequence", "fps"} <= set(rows[0]):
+        raise LaeError(f"{path}: needs a header with the columns sequence and fps")
+    trackers = sorted({row["tracker"] or "" for row in rows if "tracker" in row})
+    if trackers and tracker not in trackers:
+        raise LaeError(
+            f"{path}: has {', '.join(trackers)}, not {tracker!r}; if it is there under another "
+            "name, give that with --tracker"
+        )
+    for number, row in enumerate(rows, 2):
+        if row.get("tracker", tracker) != tracker:
+            continue
+        try:
+            frames = int(row["frames"]) if row.get("frames") else None
+            yield row["sequence"], (frames, frame_ns(parse_fps(row["fps"] or "")))
+        except (LaeError, ValueError) as error:
+            raise LaeError(f"{path}, line {number}: {error}") from error
+
+
+def _by_format(path: Path, repetition: int) -> dict[str, list[Source]]:
+    found: dict[str, list[Source]] = {}
+    if path.is_file():
+        files = [path]
+    else:
+        files = sorted(file for file in path.iterdir() if file.is_file())
+        run = f"_{repetition:03}"
+        repeated = [folder / f"{folder.name}{run}.txt" for folder in sorted(path.iterdir())]
+        for file in repeated:
+            if file.is_file():
+                times = _first_file(file.with_name(f"{file.parent.name}_time.txt"))
+                found.setdefault("text", []).append(Source(file.parent.name, file, times))
+    for file in files:
+        kind = _SUFFIXES.get(file.suffix.lower())
+        if kind == "npz":
+            found.setdefault(kind, []).extend(Source(name, file) for name in _npz_names(file))
+        elif kind:
+            found.setdefault(kind, []).append(Source(file.stem, file))
+        elif file.suffix.lower() == ".txt" and not file.stem.endswith(_NOT_BOXES):
+            name = f"{file.stem}_time{file.suffix}"
+            times = _first_file(file.with_name(name), file.parent / "times" / name)
+            found.setdefault("text", []).append(Source(file.stem, file, times))
+    return found
+
+
+def _first_file(*paths: Path) -> Path | None:
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _text_format(sources: list[Source]) -> str:
+    """Which toolkit wrote text results: pytracking separates by tabs."""
+    if not any(source.times for source in sources):
+        return "ope"
+    with sources[0].path.open("rb") as file:
+        return "pytracking" if b"\t" in file.readline(1000) else "got10k"
+
+
+def _checked_boxes(boxes: Any, where: str) -> Floats:
+    if not (isinstance(boxes, np.ndarray) and boxes.dtype.kind in "iuf" and boxes.ndim == 2):
+        raise LaeError(f"{where}: boxes must be a table of numbers")
+    if boxes.shape[1] != 4:
+        raise LaeError(f"{where}: {boxes.shape[1]} columns; boxes have 4: x, y, w, h")
+    table = boxes.astype(np.float64)
+    bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
+    if len(bad):
+        raise LaeError(f"{where}: the box in row {bad[0] + 1} is not finite; every frame needs one")
+    return table
+
+
+def _npz_names(path: Path) -> list[str]:
+    try:
+        with ZipFile(path) as archive:
+            entries = archive.infolist()
+    except (OSError, BadZipFile, ValueError) as error:
+        raise LaeError(f"{path}: not a readable .npz file: {error}") from error
+    if sum(entry.file_size for entry in entries) > _MAX_NPZ_BYTES:
+        raise LaeError(f"{path}: unpacks to more than {_MAX_NPZ_BYTES >> 20} MB")
+    return [entry.filename.removesuffix(".npy") for entry in entries]
+
+
+def _npz_boxes(path: Path, name: str) -> Floats:
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            boxes = content[name]
+    except Exception as error:  # a damaged file can raise anything
+        raise LaeError(f"{path}: array {name[:80]!r} cannot be read: {error}") from error
+    return _checked_boxes(boxes, f"{path}, array {name!r}")

@@ -1,0 +1,189 @@
+"""What forecasters learn from: the questions that replays ask, with their answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from hashlib import sha256
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from lae_sim._arrays import Floats, Ints
+from lae_sim.datasets.annotations import video_of
+from lae_sim.errors import LaeError
+from lae_sim.evaluation.evaluate import lanes_of
+from lae_sim.evaluation.pairing import histories, pair, pairs
+from lae_sim.forecast.base import (
+    AnyFactory,
+    ForecasterFactory,
+    Lanes,
+    Sequenced,
+    factory_for,
+    own_notes,
+)
+from lae_sim.replay.run import Run
+
+
+@dataclass(frozen=True, eq=False)
+class Examples:
+    """Queries of some replayed sequences at no permitted latency, with the boxes that came.
+
+    Attributes:
+        sequences: the sequence of each lane.
+        lanes: the outputs that a forecaster is fed, a lane for each replayed sequence.
+        item: the latest item known at each query, int64 [P], not decreasing.
+        frame: the world frame of each query, int64 [P].
+        truth: its ground truth, float64 [P, 4]; NaN where there is none.
+        boxes: the box that the tracker itself found there offline, float64 [P, 4]; NaN where the
+            trace has none.
+    """
+
+    sequences: tuple[str, ...]
+    lanes: Lanes
+    item: Ints
+    frame: Ints
+    truth: Floats
+    boxes: Floats
+
+    @classmethod
+    def of(cls, runs: Sequence[Run]) -> Examples:
+        """The examples of some runs of one trace."""
+        pairing = pair([run.schedule for run in runs], [Fraction(0)])
+        fed = histories(pairing)
+        found = pairs(pairing, fed)
+        lanes = lanes_of(runs, pairing, fed, np.full((len(runs), 2), np.inf))
+        ends = np.cumsum(pairing.lengths)
+        row = (ends - pairing.lengths)[lanes.lane(found.item)] + found.frame
+        return cls(
+            tuple(run.recording.name for run in runs),
+            lanes,
+            found.item,
+            found.frame,
+            np.concatenate([run.recording.truth for run in runs])[row],
+            np.concatenate([run.recording.boxes for run in runs])[row],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Examples]) -> Examples:
+        """The examples of some replays as one."""
+        starts = np.cumsum([0, *(part.lanes.offsets[-1] for part in parts)])
+        offsets = [part.lanes.offsets[:-1] + start for part, start in zip(parts, starts)]
+        lanes = Lanes(
+            np.concatenate([*offsets, starts[-1:]]),
+            *(
+                np.concatenate([getattr(part.lanes, name) for part in parts])
+                for name in ("frames", "boxes", "image_sizes")
+            ),
+        )
+        return cls(
+            tuple(name for part in parts for name in part.sequences),
+            lanes,
+            np.concatenate([part.item + start for part, start in zip(parts, starts)]),
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in ("frame", "truth", "boxes")
+            ),
+        )
+
+    def without(self, sequences: Collection[str]) -> Examples:
+        """All but some sequences: neither their outputs nor their truth is left."""
+        kept = np.array([name not in sequences for name in self.sequences])
+        lanes, asked, item = self.lanes.chosen(kept, self.item)
+        return Examples(
+            tuple(name for name, its in zip(self.sequences, kept) if its),
+            lanes,
+            item,
+            *(getattr(self, name)[asked] for name in ("frame", "truth", "boxes")),
+        )
+
+    @property
+    def weight(self) -> Floats:
+        """What each query counts, float64 [P]: every lane the same in total, as in the scores."""
+        lane = self.lanes.lane(self.item)
+        counts = np.bincount(lane, minlength=len(self.sequences))
+        weight: Floats = 1.0 / counts[lane]
+        return weight
+
+
+@runtime_checkable
+class Trainer(Protocol):
+    """What makes a forecaster from examples; named like a forecaster, and tried across folds."""
+
+    def fit(self, examples: Examples, seed: int) -> ForecasterFactory:
+        """The factory that these examples lead to."""
+
+
+@dataclass(frozen=True)
+class CrossFitted:
+    """A forecaster trained once per fold, which answers for the sequences that it has not seen.
+
+    Attributes:
+        folds: the fold of each sequence.
+        factories: the factory trained without each fold.
+    """
+
+    folds: dict[str, int]
+    factories: tuple[AnyFactory, ...]
+
+    def for_sequence(self, sequence: Sequenced) -> ForecasterFactory:
+        """The factory that was trained without this sequence."""
+        return factory_for(self.factories[self.folds[sequence.name]], sequence)
+
+    @property
+    def sees_frames(self) -> bool:
+        """Whether the factories look at frames."""
+        return any(getattr(factory, "sees_frames", False) for factory in self.factories)
+
+    def notes(self, sequences: Sequence[str]) -> list[str]:
+        """What each fold's factory has to say of the sequences that it scores."""
+        notes: dict[str, None] = {}
+        for fold, factory in enumerate(self.factories):
+            scored = [name for name in sequences if self.folds[name] == fold]
+            notes.update(dict.fromkeys(own_notes(factory, scored)))
+        return list(notes)
+
+
+def cross_fitted(
+    trainer: Trainer,
+    examples: Examples,
+    folds: dict[str, int],
+    seed: int = 0,
+    progress: Callable[[], object] = lambda: None,
+) -> CrossFitted:
+    """Train once per fold, without the fold's sequences.
+
+    Args:
+        trainer: makes a forecaster from examples.
+        examples: of all sequences, those to be scored among them.
+        folds: the fold of each sequence (see :func:`assign_folds`).
+        seed: of the training.
+        progress: called before each fold.
+    """
+    factories = []
+    for fold in range(max(folds.values()) + 1):
+        progress()
+        held_out = {name for name, its in folds.items() if its == fold}
+        factories.append(trainer.fit(examples.without(held_out), seed))
+    return CrossFitted(folds, tuple(factories))
+
+
+def assign_folds(sequences: Iterable[str], folds: int = 5, seed: int = 0) -> dict[str, int]:
+    """Deal sequences out to folds; the parts of one video stay together.
+
+    The videos are dealt in the order of a hash of the seed and their names, the largest fold one
+    video larger than the smallest.
+
+    Raises:
+        LaeError: if there is but one video, or fewer than two folds are asked for.
+    """
+    if folds < 2:
+        raise LaeError("training on some sequences to score others needs at least two folds")
+    videos: dict[str, list[str]] = {}
+    for name in sorted(set(sequences)):
+        videos.setdefault(video_of(name), []).append(name)
+    if len(videos) < 2:
+        raise LaeError("there is only one video: nothing is left to train on if it is scored")
+    order = sorted(videos, key=lambda video: sha256(f"{seed}\0{video}".encode()).digest())
+    return {name: k % folds for k, video in enumerate(order) for name in videos[video]}

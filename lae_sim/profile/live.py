@@ -1,0 +1,283 @@
+"""The live service: a tracker run on real frames under the engine's clock.
+
+The clock is virtual. What the tracker took, or what another device would have taken, becomes the
+event's delay; nothing waits in real time. With a pre-forecaster the loop is closed: before each
+frame the predicted box sets the tracker's search region (Li et al., "Predictive Visual Tracking",
+2021, Alg. 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from time import perf_counter_ns
+from typing import Any
+
+import numpy as np
+
+from lae_sim._arrays import Floats, Ints
+from lae_sim.datasets.frames import Image, ImageSequence
+from lae_sim.engine.clock import Clock
+from lae_sim.engine.policies import latest, listed
+from lae_sim.engine.scheduler import Policy, Service, simulate
+from lae_sim.errors import LaeError, explained
+from lae_sim.forecast.base import AnyFactory, Forecaster, factory_for
+from lae_sim.profile.timed import Answer, TimedTracker
+from lae_sim.replay.strides import phases
+from lae_sim.trace.recording import Recording
+
+
+@dataclass(frozen=True, eq=False)
+class LiveRun:
+    """One sequence as a live tracker went through it.
+
+    Attributes:
+        recording: truth, boxes, times and scores, by world frame. Where the tracker found nothing,
+            the box before stands.
+        frames: processed frames, int64 [n], increasing.
+        measured_ns: what this machine took for each, int64 [n]; not the recording's times if those
+            are another device's.
+        cpu_ns: CPU time of all calls together, ns.
+        lost: processed frames where the tracker found nothing, int64 [k].
+        image_size: width and height, pixels.
+    """
+
+    recording: Recording
+    frames: Ints
+    measured_ns: Ints
+    cpu_ns: int
+    lost: Ints
+    image_size: tuple[int, int]
+
+
+def run_real_time(
+    sequence: ImageSequence,
+    tracker: TimedTracker,
+    clock: Clock,
+    policy: Policy = latest,
+    **options: Any,
+) -> LiveRun:
+    """Run a tracker through one sequence, skipping the frames that its busy times make it skip.
+
+    Args:
+        sequence: frames, and the truth, whose first box initialises the tracker.
+        tracker: a tracker with a stopwatch.
+        clock: the world's clock.
+        policy: which frame is next.
+        options: see :class:`Live`.
+
+    Raises:
+        LaeError: if the first box or a frame cannot be used, or the tracker fails.
+    """
+    live = Live(sequence, tracker, **options)
+    schedule = simulate(len(sequence), clock, live, policy)
+    return live.result(schedule.frames)
+
+
+def run_every_frame(
+    sequence: ImageSequence,
+    tracker: TimedTracker,
+    stride: Fraction = Fraction(1),
+    **options: Any,
+) -> LiveRun:
+    """Run a tracker on every frame; the world waits for it.
+
+    Args:
+        sequence, tracker, options: as of :func:`run_real_time`.
+        stride: above 1, the tracker goes through the sequence in several phases, each of which
+            skips frames, until every frame has been processed (see :mod:`lae_sim.replay.strides`).
+
+    Raises:
+        LaeError: as :func:`run_real_time`.
+    """
+    length = len(sequence)
+    runs = []
+    for frames in phases(Fraction(stride), length):
+        live = Live(sequence, tracker, **options)
+
+        def instantly(frame: int, process: Service = live) -> int:
+            process(frame)
+            return 0
+
+        simulate(length, Clock.at(Fraction(1)), instantly, listed(frames.tolist()))
+        runs.append(live.result(frames))
+    whole, measured = runs[-1], np.zeros(length, np.int64)
+    for run in reversed(runs):  # of the phases that hold a frame, the first stands
+        measured[run.frames] = run.measured_ns
+        for name in ("boxes", "elapsed_ns", "score"):
+            getattr(whole.recording, name)[run.frames] = getattr(run.recording, name)[run.frames]
+    return replace(
+        whole,
+        frames=np.arange(length),
+        measured_ns=measured,
+        cpu_ns=sum(run.cpu_ns for run in runs),
+        lost=np.unique(np.concatenate([run.lost for run in runs])),
+    )
+
+
+class Live:
+    """The service that runs a tracker through one sequence, and keeps its answers."""
+
+    def __init__(
+        self,
+        sequence: ImageSequence,
+        tracker: TimedTracker,
+        pre_forecaster: AnyFactory | None = None,
+        keep_size: bool = False,
+        service: Service | None = None,
+        include_decode: bool = False,
+        forecaster_ns: int | None = 0,
+        progress: Callable[[int], object] = lambda frames: None,
+    ) -> None:
+        """Check that the tracker can start.
+
+        Args:
+            sequence: frames and truth.
+            tracker: a tracker with a stopwatch.
+            pre_forecaster: sets the search region before each frame; needs a tracker that
+                ``sets_search``.
+            keep_size: search for the size last found at the predicted centre; otherwise for the
+                predicted size, as in Alg. 1.
+            service: times of another device, by frame, instead of the measured ones.
+            include_decode: count the decoding of a frame as part of its processing.
+            forecaster_ns: what the pre-forecaster adds to a frame's time, ns; None to measure it.
+            progress: told how many more world frames are done, after each processed one.
+
+        Raises:
+            LaeError: if the sequence has no first box, or the tracker's search cannot be set.
+        """
+        box = sequence.truth[0]
+        if not (np.isfinite(box).all() and (box[2:] > 0).all()):
+            raise LaeError(
+                f"sequence {sequence.name!r}: its first box is {_told(box)}, and a tracker needs "
+                "one with a width and a height"
+            )
+        if pre_forecaster is not None and not tracker.sets_search:
+            raise LaeError("a pre-forecaster needs a tracker whose search can be set: translate it")
+        self._sequence = sequence
+        self._tracker = tracker
+        self._pre_forecaster = pre_forecaster
+        self._keep_size = keep_size
+        self._found: Sequence[float] = box.tolist()
+        self._forecaster: Forecaster | None = None
+        self._service = service
+        self._include_decode = include_decode
+        self._forecaster_ns = forecaster_ns
+        self._forecasting_ns = 0
+        self._progress = progress
+        self._last = -1
+        self._size = (0, 0)
+        self._answers: list[Answer] = []
+        self._elapsed_ns: list[int] = []
+
+    def __call__(self, frame: int) -> int:
+        """Process a frame; the time it took, ns."""
+        before = perf_counter_ns()
+        image = self._sequence.read(frame)
+        decoding = perf_counter_ns() - before if self._include_decode else 0
+        try:
+            self._check(frame, image)
+            answer = self._init(image) if frame == 0 else self._track(frame, image)
+        except LaeError as error:
+            name = self._sequence.name
+            raise type(error)(f"sequence {name!r}, frame {frame}: {error}") from error
+        self._answers.append(answer)
+        self._progress(frame - self._last)
+        self._last = frame
+        elapsed_ns = self._service(frame) if self._service else answer.elapsed_ns + decoding
+        elapsed_ns += self._forecasting_ns
+        self._elapsed_ns.append(elapsed_ns)
+        return elapsed_ns
+
+    def _init(self, image: Image) -> Answer:
+        box = self._sequence.truth[0].tolist()
+        if self._pre_forecaster is not None:
+            with explained("the pre-forecaster"):
+                factory = factory_for(self._pre_forecaster, self._sequence)
+                self._forecaster = factory(box, self._size)
+        return self._tracker.init(image, box)
+
+    def _track(self, frame: int, image: Image) -> Answer:
+        if self._forecaster is None:
+            return self._tracker.track(image)
+        with explained("the pre-forecaster"):
+            before = perf_counter_ns()
+            x, y, w, h = self._forecaster.predict(frame)
+            spent = perf_counter_ns() - before
+            if self._keep_size:
+                _, _, last_w, last_h = self._found
+                x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
+            search = search_of([x, y, w, h], self._size)
+        answer = self._tracker.track(image, search)
+        if answer.box is not None:
+            self._found = answer.box
+            with explained("the pre-forecaster"):
+                before = perf_counter_ns()
+                self._forecaster.update(frame, answer.box)
+                spent += perf_counter_ns() - before
+        self._forecasting_ns = spent if self._forecaster_ns is None else self._forecaster_ns
+        return answer
+
+    def _check(self, frame: int, image: Image) -> None:
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise LaeError(f"a frame must be uint8 [H, W, 3], not {image.dtype} {image.shape}")
+        size = image.shape[1], image.shape[0]
+        if frame == 0:
+            self._size = size
+            x, y, w, h = self._sequence.truth[0]
+            if x >= size[0] or y >= size[1] or x + w <= 0 or y + h <= 0:
+                raise LaeError(
+                    f"the first box {_told(self._sequence.truth[0])} lies outside the "
+                    f"{size[0]}x{size[1]} image"
+                )
+        elif size != self._size:
+            raise LaeError(
+                f"the image is {size[0]}x{size[1]}, and the first one "
+                f"{self._size[0]}x{self._size[1]}"
+            )
+
+    def result(self, frames: Ints) -> LiveRun:
+        """What was done, given the frames that were processed."""
+        length = len(self._sequence)
+        boxes, elapsed = np.full((length, 4), np.nan), np.full(length, -1, np.int64)
+        scores = np.full(length, np.nan, np.float32)
+        found: list[Sequence[float]] = []
+        for answer in self._answers:
+            found.append(found[-1] if answer.box is None else answer.box)
+        boxes[frames] = found
+        elapsed[frames] = self._elapsed_ns
+        scores[frames] = [np.nan if a.score is None else a.score for a in self._answers]
+        return LiveRun(
+            Recording.new(self._sequence.name, self._sequence.truth, boxes, elapsed, scores),
+            frames,
+            np.array([answer.elapsed_ns for answer in self._answers], np.int64),
+            sum(answer.cpu_ns for answer in self._answers),
+            frames[[answer.box is None for answer in self._answers]],
+            self._size,
+        )
+
+
+def search_of(box: Sequence[float], size: tuple[int, int]) -> list[float]:
+    """A predicted box as a search region: centre and size ``cx, cy, w, h`` within the image.
+
+    The centre is ``x + w/2, y + h/2``, kept inside the image; a side is kept between 1 pixel and
+    the image's, since trackers crash or stall on others.
+
+    Raises:
+        LaeError: if the box is not finite.
+    """
+    x, y, w, h = (float(value) for value in box)
+    if not np.isfinite((x, y, w, h)).all():
+        raise LaeError(f"the pre-forecaster predicted {_told([x, y, w, h])}, not a box")
+    width, height = size
+    return [
+        min(max(x + w / 2, 0.0), float(width)),
+        min(max(y + h / 2, 0.0), float(height)),
+        min(max(w, 1.0), float(width)),
+        min(max(h, 1.0), float(height)),
+    ]
+
+
+def _told(box: Sequence[float] | Floats) -> str:
+    return ", ".join(f"{value:g}" for value in box)

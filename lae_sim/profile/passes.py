@@ -1,0 +1,276 @@
+"""The passes of a profile: each runs every sequence in one way and becomes one trace."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lae_sim.datasets.frames import Buffered, Dataset, ImageSequence
+from lae_sim.engine.clock import Clock, parse_duration
+from lae_sim.engine.scheduler import Service
+from lae_sim.errors import LaeError
+from lae_sim.profile.device import describe_device, readings, source_version
+from lae_sim.profile.journal import Journal
+from lae_sim.profile.live import Live, LiveRun
+from lae_sim.profile.timed import TimedTracker, TrackerError
+from lae_sim.replay.latency import by_frame
+from lae_sim.trace.file import Trace, read_trace, write_trace
+from lae_sim.trace.metadata import FORMAT, VERSION, Metadata
+
+READING_INTERVAL_S = 10.0
+
+Timing = Callable[[ImageSequence], Service]
+"""``timing(sequence)`` makes the service that times a sequence."""
+
+Progress = Callable[[int], object]
+"""``progress(frames)`` is told how many more world frames are done."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One way to run every sequence.
+
+    Attributes:
+        name: of its part of the journal.
+        path: where its trace goes.
+        metadata: of the trace, but for what is known only after the sequences.
+        run: ``run(sequence, progress=progress)`` runs the tracker through a sequence.
+        rounds: how often it goes through each sequence.
+    """
+
+    name: str
+    path: Path
+    metadata: Metadata
+    run: Callable[..., LiveRun]
+    rounds: int = 1
+
+
+def parse_timing(text: str) -> tuple[str, Timing]:
+    """Times of another device: ``constant:47ms``, or a trace's by frame.
+
+    Returns:
+        What a trace says of such times, and the times.
+
+    Raises:
+        LaeError: if the text is neither, or the trace cannot be read.
+    """
+    kind, _, value = text.partition(":")
+    if kind == "constant":
+        elapsed_ns = parse_duration(value)
+        return f"constant {value}, not measured", lambda sequence: lambda frame: elapsed_ns
+    trace = read_trace(text)
+    recordings = {recording.name: recording for recording in trace}
+
+    def timing(sequence: ImageSequence) -> Service:
+        found = recordings.get(sequence.name)
+        if found is None:
+            raise LaeError(f"{text}: has no times of sequence {sequence.name!r}")
+        if len(found) != len(sequence):
+            raise LaeError(
+                f"{text}: has {len(found)} frames of sequence {sequence.name!r}, which has "
+                f"{len(sequence)} here"
+            )
+        return by_frame(found)
+
+    return f"{Path(text).name} ({trace.metadata.device}), not measured here", timing
+
+
+def base_document(
+    name: str, tracker: TimedTracker, dataset: str, clock: Clock, warmup: int, includes: str
+) -> dict[str, Any]:
+    """The metadata that all passes of a profile share.
+
+    Args:
+        name: the tracker, as the command line has it.
+        tracker: the tracker, which says more of itself.
+        dataset: the dataset's name.
+        clock: the world's clock.
+        warmup: calls before anything is measured.
+        includes: what the times include.
+    """
+    told = dict(tracker.describe())
+    measured = {key: told.pop(key) for key in ("synchronised", "threads") if key in told}
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "fps": str(clock.fps),
+        "tracker": {"name": name, **told},
+        "device": {**describe_device(), "readings": {"before": readings()}},
+        "timing": {
+            "clock": "perf_counter_ns",
+            "warmup_calls": warmup,
+            "includes": includes,
+            **measured,
+        },
+        "schedule": {},
+        "dataset": {"name": dataset},
+        "lae_sim": source_version(),
+    }
+
+
+def scheduled(document: Mapping[str, Any], source: str = "measured", **schedule: Any) -> Metadata:
+    """The metadata of one pass.
+
+    Args:
+        document: what all passes share.
+        source: what the times are.
+        schedule: keys of the metadata's schedule, ``kind`` among them.
+    """
+    timing = {"source": source, **document["timing"]}
+    return Metadata.of(
+        {**document, "timing": timing, "schedule": {**schedule, **document["schedule"]}}
+    )
+
+
+def run_pass(
+    task: Pass,
+    dataset: Dataset,
+    tracker: TimedTracker,
+    journal: Journal,
+    warmup: int,
+    progress: Progress,
+    buffered: bool = True,
+) -> list[dict[str, Any]]:
+    """Run the sequences that the journal lacks, and put each into it.
+
+    Args:
+        task: the pass.
+        dataset: the sequences.
+        tracker: the tracker that the pass runs, to warm it up.
+        journal: where finished sequences are kept.
+        warmup: calls before the first sequence, and after each failure of the tracker.
+        progress: told of world frames done.
+        buffered: whether frames are decoded ahead of the measurement.
+
+    Returns:
+        What failed: ``sequence`` and ``reason`` of each.
+
+    Raises:
+        LaeError: if a finished sequence cannot be written.
+    """
+    failures = []
+    finished = set(journal.finished(task.name))
+    cold, read_at = True, -math.inf
+    for order, sequence in enumerate(dataset.sequences):
+        left = len(sequence) * task.rounds
+
+        def advance(frames: int) -> None:
+            nonlocal left
+            left -= frames
+            progress(frames)
+
+        if sequence.name in finished:
+            advance(left)
+            continue
+        ready = replace(sequence, read=Buffered(sequence.read, len(sequence)))
+        try:
+            if cold:
+                warm_up(tracker, ready, warmup)
+                cold = False
+            run = task.run(ready if buffered else sequence, progress=advance)
+        except LaeError as error:
+            failures.append({"sequence": sequence.name, "reason": str(error)})
+            cold = cold or isinstance(error, TrackerError)
+        else:
+            during = []
+            if time.monotonic() - read_at > READING_INTERVAL_S:
+                during = [{"sequence": sequence.name, **readings()}]
+                read_at = time.monotonic()
+            metadata = _of_sequence(task.metadata, sequence, run, order, during)
+            journal.add(task.name, run.recording, metadata)
+        advance(left)
+    return failures
+
+
+def write_pass(task: Pass, journal: Journal, failures: list[dict[str, Any]]) -> Metadata | None:
+    """Write the trace of a pass from its finished sequences; None if there are none.
+
+    Raises:
+        LaeError: if it cannot be written.
+    """
+    kept = [metadata.document for metadata in journal.metadata(task.name)]
+    if not kept:
+        return None
+    document = dict(task.metadata.document)
+    document["sequences"] = {name: entry for d in kept for name, entry in d["sequences"].items()}
+    during = [reading for d in kept for reading in d["device"]["readings"]["during"]]
+    during.sort(key=lambda reading: str(reading.get("time")))
+    before = min(
+        (d["device"]["readings"]["before"] for d in kept), key=lambda r: str(r.get("time"))
+    )
+    device = dict(document["device"])
+    device["readings"] = {"before": before, "during": during, "after": readings()}
+    document["device"] = device
+    if failures:
+        document["failures"] = failures
+    entries = document["sequences"].values()
+    measured = sum(entry["measured_ns"] for entry in entries)
+    cpu = sum(entry["cpu_ns"] for entry in entries)
+    document["timing"] = {**document["timing"], "cpu_share": round(cpu / max(measured, 1), 3)}
+    metadata = Metadata.of(document)
+    write_trace(Trace(metadata, journal.recordings(task.name)), task.path)
+    return metadata
+
+
+def summary(path: Path) -> dict[str, Any]:
+    """What a profiled trace holds, in short: counts, and times in ms."""
+    trace = read_trace(path)
+    recordings = list(trace)
+    calls = np.concatenate([r.elapsed_ns[1:][r.elapsed_ns[1:] >= 0] for r in recordings])
+    entries = trace.metadata.document["sequences"].values()
+    return {
+        "trace": str(path),
+        "schedule": trace.metadata.document["schedule"],
+        "timing": trace.metadata.document["timing"]["source"],
+        "sequences": len(recordings),
+        "world_frames": sum(map(len, recordings)),
+        "processed": len(recordings) + len(calls),
+        "lost": sum(entry["lost"] for entry in entries),
+        "init_ms": float(np.mean([r.elapsed_ns[0] for r in recordings])) / 1e6,
+        "median_ms": float(np.median(calls)) / 1e6 if len(calls) else None,
+        "p95_ms": float(np.percentile(calls, 95)) / 1e6 if len(calls) else None,
+    }
+
+
+def warm_up(tracker: TimedTracker, sequence: ImageSequence, calls: int) -> None:
+    """Initialise the tracker and let it track ``calls`` times, unmeasured.
+
+    Raises:
+        LaeError: if a frame cannot be read, or the tracker fails.
+    """
+    if calls:
+        live = Live(sequence, tracker)
+        live(0)
+        for _ in range(calls):
+            live(min(1, len(sequence) - 1))
+
+
+def _of_sequence(
+    metadata: Metadata,
+    sequence: ImageSequence,
+    run: LiveRun,
+    order: int,
+    during: list[dict[str, Any]],
+) -> Metadata:
+    """The metadata of a pass for one finished sequence."""
+    document = dict(metadata.document)
+    document["sequences"] = {
+        sequence.name: {
+            "image_size": list(run.image_size),
+            **({"attributes": list(sequence.attributes)} if sequence.attributes else {}),
+            "order": order,
+            "lost": len(run.lost),
+            "measured_ns": int(run.measured_ns.sum()),
+            "cpu_ns": run.cpu_ns,
+        }
+    }
+    device = dict(document["device"])
+    device["readings"] = {**device["readings"], "during": during}
+    document["device"] = device
+    return Metadata.of(document)

@@ -1,0 +1,213 @@
+"""Latency sources: where a replay takes its processing times from.
+
+A source makes, for each recording, the service that the engine asks how long a frame takes. Those
+made here know all times before the first call (:class:`Times`), so many sequences can be scheduled
+at once (:mod:`lae_sim.engine.lanes`). Random sources draw from one stream per sequence, seeded by
+the seed and the sequence's name, so the order and the number of sequences never change a result.
+Streams are raw 64-bit words of PCG64 and the arithmetic on them is ours, so that they are the same
+under every NumPy version; the lognormal one also rests on the platform's exp and log, whose last
+bit may differ before rounding to ns.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import partial
+from operator import index
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim._arrays import Ints
+from lae_sim.engine.clock import MAX_INT64
+from lae_sim.engine.scheduler import Service
+from lae_sim.engine.times import Times
+from lae_sim.errors import LaeError
+from lae_sim.trace.recording import Recording
+
+LatencySource = Callable[[Recording], Service]
+"""``source(recording)`` returns the service that times that sequence."""
+
+Words = npt.NDArray[np.uint64]
+
+
+def by_frame(recording: Recording) -> Times:
+    """The time recorded for the frame itself."""
+    return Times(recording.name, recording.elapsed_ns)
+
+
+def by_call(recording: Recording) -> Times:
+    """The k-th call takes the k-th recorded time: warm-up stalls belong to the call."""
+    return Times(recording.name, _recorded(recording), by_call=True)
+
+
+def constant(elapsed_ns: int) -> LatencySource:
+    """Every call takes ``elapsed_ns``, the initialisation too.
+
+    Raises:
+        LaeError: if it is below zero.
+    """
+    if index(elapsed_ns) < 0:
+        raise LaeError(f"a processing time cannot be negative ({elapsed_ns} ns)")
+    ns = np.array(min(elapsed_ns, MAX_INT64), np.int64)
+
+    def source(recording: Recording) -> Times:
+        return Times(recording.name, np.broadcast_to(ns, len(recording)), by_call=True)
+
+    return source
+
+
+@dataclass(frozen=True)
+class RandomSource:
+    """Draws the time of every call but the initialisation, which keeps its recorded one.
+
+    Attributes:
+        seed: of the streams.
+        draw: makes times in ns, int64 [R, n], of the recorded ones (without the initialisation's,
+            unless there is no other) and of uniform words, uint64 [R, n].
+        repetition: which part of a sequence's stream is used: T words each, the last one idle.
+        factors: exact factors on the times, one after another.
+    """
+
+    seed: int
+    draw: Callable[[Ints, Words], npt.ArrayLike]
+    repetition: int = 0
+    factors: tuple[Fraction, ...] = ()
+
+    def __call__(self, recording: Recording) -> Times:
+        """The times of this repetition."""
+        times = self.repeated(recording, self.repetition, 1)[0]
+        return Times(recording.name, times, by_call=True)
+
+    def repeated(self, recording: Recording, first: int, count: int) -> Ints:
+        """The times of all possible calls in some repetitions, ns, int64 [count, T]."""
+        recorded, length = _recorded(recording), len(recording)
+        digest = hashlib.sha256(f"{self.seed}\0{recording.name}".encode()).digest()
+        stream: Any = np.random.PCG64(int.from_bytes(digest, "big"))
+        words = stream.advance(first * length).random_raw(count * length).reshape(count, length)
+        times = np.empty((count, length), np.int64)
+        times[:, 0] = recorded[0]
+        times[:, 1:] = self.draw(recorded[1:] if len(recorded) > 1 else recorded, words[:, :-1])
+        for factor in self.factors:
+            times = _times(factor, times)
+        return times
+
+
+def resampled(seed: int, repetition: int = 0) -> RandomSource:
+    """Each call draws one of the sequence's recorded times, with replacement.
+
+    Initialisation keeps its recorded time and is not drawn for the other calls. Another repetition
+    draws from another part of the same stream.
+    """
+    return RandomSource(seed, _one_by_one, repetition)
+
+
+def _one_by_one(times: Ints, words: Words) -> Ints:
+    drawn: Ints = times[_below(len(times), words)]
+    return drawn
+
+
+def bootstrap(seed: int, block: int = 30, repetition: int = 0) -> RandomSource:
+    """Blocks of consecutive recorded times, which keep stalls and autocorrelation.
+
+    The circular block bootstrap: every block begins at a call that is drawn uniformly, and goes on
+    from the last call to the first (Politis and Romano, "A circular block-resampling procedure for
+    stationary data", 1992). Initialisation keeps its recorded time and is not drawn.
+
+    Args:
+        seed: of the streams.
+        block: calls in a block.
+        repetition: another one draws from another part of the same stream.
+
+    Raises:
+        LaeError: if a block has no calls.
+    """
+    if block < 1:
+        raise LaeError(f"a block of times needs at least one call, not {block}")
+    return RandomSource(seed, partial(_in_blocks, block), repetition)
+
+
+def _in_blocks(block: int, times: Ints, words: Words) -> Ints:
+    repetitions, calls = words.shape
+    block = max(min(block, calls), 1)
+    blocks = -(-calls // block)
+    starts = _below(len(times), words[:, :blocks])
+    circle = np.resize(times, len(times) + block - 1)
+    drawn = np.lib.stride_tricks.sliding_window_view(circle, block)[starts]
+    return drawn.reshape(repetitions, blocks * block)[:, :calls]
+
+
+def lognormal(seed: int, repetition: int = 0) -> RandomSource:
+    """Each call draws from the lognormal distribution fitted to the sequence's recorded times.
+
+    The fit is by moments of the logarithm, times below 1 ns counting as 1 ns. Initialisation keeps
+    its recorded time and is left out of the fit. Another repetition draws from another part of the
+    same stream.
+    """
+    return RandomSource(seed, _from_fit, repetition)
+
+
+def _from_fit(times: Ints, words: Words) -> list[list[int]]:
+    logs = [math.log(max(ns, 1)) for ns in times.tolist()]
+    mean = math.fsum(logs) / len(logs)
+    deviation = math.sqrt(math.fsum((log - mean) ** 2 for log in logs) / len(logs))
+    inverse = NormalDist().inv_cdf
+
+    def draw(word: int) -> int:
+        uniform = ((word >> 11) + 0.5) / 2**53
+        return min(round(math.exp(mean + deviation * inverse(uniform))), MAX_INT64)
+
+    return [[draw(word) for word in row] for row in words.tolist()]
+
+
+def scaled(source: LatencySource, factor: Fraction) -> LatencySource:
+    """The times of another source times an exact factor, rounded half to even to whole ns.
+
+    Raises:
+        LaeError: if the factor is below zero.
+    """
+    if factor < 0:
+        raise LaeError(f"times cannot be scaled by {factor}, below zero")
+    if factor == 1:
+        return source
+    if isinstance(source, RandomSource):
+        return replace(source, factors=(*source.factors, factor))
+
+    def scaled_source(recording: Recording) -> Service:
+        service = source(recording)
+        if isinstance(service, Times):
+            return replace(service, ns=_times(factor, service.ns))
+        return lambda frame: round(index(service(frame)) * factor)
+
+    return scaled_source
+
+
+def _times(factor: Fraction, ns: Ints) -> Ints:
+    """Times by an exact factor, at most 2**63 - 1 ns, which no schedule holds; -1 stays."""
+    p, q = factor.numerator, factor.denominator
+    if max(int(ns.max()), 1) * p + 2 * q > MAX_INT64:
+        exact = (n if n < 0 else min(round(n * factor), MAX_INT64) for n in ns.ravel().tolist())
+        return np.fromiter(exact, np.int64, ns.size).reshape(ns.shape)
+    whole, rest = np.divmod(ns * p, q)
+    whole += 2 * rest + (whole & 1) > q  # half goes to the even neighbour
+    whole[ns < 0] = -1
+    return whole
+
+
+def _recorded(recording: Recording) -> Ints:
+    """The recorded times in the order of the calls, int64 [n]."""
+    times: Ints = recording.elapsed_ns[recording.elapsed_ns >= 0]
+    return times
+
+
+def _below(limit: int, words: Words) -> Ints:
+    """Whole numbers below a limit of at most 2**32: ``words * limit >> 64``."""
+    half, n = np.uint64(32), np.uint64(limit)
+    high, low = words >> half, words & np.uint64(2**32 - 1)
+    return (high * n + (low * n >> half) >> half).astype(np.int64)

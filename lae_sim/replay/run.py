@@ -1,0 +1,273 @@
+"""Replaying recordings: the engine fed with recorded times and boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+
+from lae_sim._arrays import Floats, Ints
+from lae_sim.boxes import PARTED_IOU, iou
+from lae_sim.engine.clock import Clock
+from lae_sim.engine.lanes import simulate_lanes
+from lae_sim.engine.policies import latest
+from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
+from lae_sim.engine.times import Times
+from lae_sim.errors import LaeError
+from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
+from lae_sim.replay.strides import followed
+from lae_sim.trace.file import Trace
+from lae_sim.trace.recording import Recording, batched
+
+_GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
+_LANE_FRAMES = 1 << 21  # and of their repetitions
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One sequence replayed.
+
+    Attributes:
+        recording: the sequence as recorded.
+        schedule: what was processed, and when.
+        boxes: the box of each processed frame, float64 [n, 4]; with strided passes perhaps of
+            another pass than the recording.
+        departures: processed frames (the first left out) whose preceding processed frame is not
+            the one they followed when they were recorded. Above 0, the boxes of a stateful tracker
+            are an approximation: it would have seen other motion.
+        disagreement: share of processed frames where the box of the next lower or next higher
+            stride overlaps less than half, 0 if the replay is exact, NaN without strided passes.
+            Where it is high the tracker's luck depends on the frames that it sees.
+    """
+
+    recording: Recording
+    schedule: Schedule
+    boxes: Floats
+    departures: int
+    disagreement: float = np.nan
+
+    def __len__(self) -> int:
+        """Number of world frames T."""
+        return self.schedule.length
+
+
+def replay_sequence(
+    recording: Recording,
+    clock: Clock,
+    source: LatencySource = by_frame,
+    policy: Policy = latest,
+    times: Recording | None = None,
+    stride: Fraction = Fraction(1),
+    strided: Mapping[Fraction, Recording] | None = None,
+) -> Run:
+    """Replay a recording under a latency source and a policy.
+
+    Args:
+        recording: the boxes and the truth.
+        clock: the world's frame rate.
+        source: how to take processing times from a recording.
+        policy: which frame is processed next.
+        times: the same sequence recorded on another device, to take the times from.
+        stride: that of the recording, if it holds every frame (see :mod:`lae_sim.replay.strides`).
+        strided: recordings of every frame at other strides. The boxes are taken from the pass whose
+            stride is nearest to the mean number of frames from one output to the next.
+
+    Raises:
+        LaeError: if a frame is asked for that the recording lacks, or the recordings differ in
+            length; it names the sequence and the frame.
+    """
+    job = _Job(recording, recording if times is None else times, strided or {}, stride)
+    return job.run(simulate(len(recording), clock, source(job.times), policy))
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A recording with what its replay needs besides: times, passes at other strides, its own."""
+
+    recording: Recording
+    times: Recording
+    passes: Mapping[Fraction, Recording]
+    stride: Fraction
+
+    def __post_init__(self) -> None:
+        for other in (self.times, *self.passes.values()):
+            if len(other) != len(self.recording):
+                raise LaeError(
+                    f"sequence {self.recording.name!r} has {len(self.recording)} frames in one "
+                    f"trace and {len(other)} in another"
+                )
+
+    def __len__(self) -> int:
+        return len(self.recording)
+
+    def run(self, schedule: Schedule) -> Run:
+        recording, frames = self.recording, schedule.frames
+        if self.passes:
+            return _from_passes(recording, {self.stride: recording, **self.passes}, schedule)
+        departures = _departures(self.before, frames)
+        return Run(recording, schedule, _boxes(recording, frames), departures)
+
+    @cached_property
+    def before(self) -> Ints:
+        return _before(self.recording, self.stride)
+
+
+def _boxes(recording: Recording, frames: Ints) -> Floats:
+    """The boxes of some frames, float64 [n, 4]."""
+    boxes: Floats = recording.boxes.take(frames, axis=0)
+    absent = np.isnan(boxes[:, 0])
+    if absent.any():
+        raise LaeError(
+            f"sequence {recording.name!r}, frame {frames[absent][0]}: the trace has no "
+            "box for it, since the tracker skipped it; replay a trace of every frame instead"
+        )
+    return boxes
+
+
+def _before(recording: Recording, stride: Fraction) -> Ints:
+    """The frame that each one followed when it was recorded, or would have, int64 [T]; 0: -1."""
+    if stride > 1:
+        return followed(stride, len(recording))
+    processed = ~np.isnan(recording.boxes[:, 0])
+    latest_one = np.maximum.accumulate(np.where(processed, np.arange(len(processed)), -1))
+    return np.concatenate([[-1], latest_one[:-1]])
+
+
+def _departures(before: Ints, frames: Ints) -> int:
+    """How many of some frames followed another one when they were recorded."""
+    return int(np.count_nonzero(before.take(frames[1:]) != frames[:-1]))
+
+
+def _from_passes(
+    recording: Recording, passes: Mapping[Fraction, Recording], schedule: Schedule
+) -> Run:
+    """The run whose boxes come from the pass that is nearest to its mean step."""
+    frames = schedule.frames
+    step = Fraction(int(frames[-1]), max(len(frames) - 1, 1))
+    strides = sorted(passes)
+    nearest = min(range(len(strides)), key=lambda k: abs(strides[k] - step))
+    source = passes[strides[nearest]]
+    boxes = _boxes(source, frames)
+    departures = _departures(_before(source, strides[nearest]), frames)
+    parted = np.zeros(len(frames), bool)
+    for stride in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
+        parted |= iou(_boxes(passes[stride], frames), boxes) < PARTED_IOU
+    return Run(recording, schedule, boxes, departures, float(parted.mean()))
+
+
+def replay_trace(
+    trace: Trace,
+    fps: Fraction | None = None,
+    source: LatencySource = by_frame,
+    policy: Policy = latest,
+    timing: Trace | None = None,
+    strided: Sequence[Trace] = (),
+    batch: bool = False,
+) -> Iterator[Run]:
+    """Replay every sequence of a trace, one after another.
+
+    Args:
+        trace: the boxes and the truth.
+        fps: world frame rate; the trace's own by default.
+        source: how to take processing times from a recording.
+        policy: which frame is processed next.
+        timing: another device's trace to take the times from; it must have the same sequences.
+        strided: traces of the same tracker at other strides (see :func:`replay_sequence`).
+        batch: schedule many sequences at once where source and policy allow it (see
+            :func:`lae_sim.engine.lanes.batchable`). The runs are the same, and come in groups.
+
+    Raises:
+        LaeError: if a sequence or frame that is asked for is not there.
+    """
+    clock = Clock.at(trace.metadata.fps if fps is None else fps)
+    for jobs in batched(_jobs(trace, timing, strided), _GROUP_FRAMES if batch else 1):
+        yield from _replayed(jobs, clock, [source(job.times) for job in jobs], policy)
+
+
+def replay_repeated(
+    trace: Trace,
+    source: RandomSource,
+    count: int,
+    fps: Fraction | None = None,
+    policy: Policy = latest,
+    timing: Trace | None = None,
+    first: int = 0,
+) -> Iterator[tuple[int, Run]]:
+    """Replay a trace again and again, under other random times in each repetition.
+
+    Args:
+        trace: the boxes and the truth.
+        source: draws the times; its own repetition does not count.
+        count: number of repetitions.
+        fps: world frame rate; the trace's own by default.
+        policy: which frame is processed next.
+        timing: another device's trace to take the times from.
+        first: the first repetition.
+
+    Yields:
+        The repetition and the run, which is that of :func:`replay_trace` with the source in that
+        repetition. Sequences come in groups; in a group, repetition after repetition, and in a
+        repetition sequence after sequence.
+
+    Raises:
+        LaeError: if a sequence or frame that is asked for is not there.
+    """
+    clock = Clock.at(trace.metadata.fps if fps is None else fps)
+    for jobs in batched(_jobs(trace, timing), _GROUP_FRAMES):
+        size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
+        for begin in range(first, first + count, size):
+            some = range(begin, min(begin + size, first + count))
+            drawn = [source.repeated(job.times, begin, len(some)) for job in jobs]
+            times = [
+                Times(job.recording.name, rows[k], by_call=True)
+                for k in range(len(some))
+                for job, rows in zip(jobs, drawn)
+            ]
+            runs = _replayed(jobs * len(some), clock, times, policy)
+            yield from ((r, next(runs)) for r in some for _ in jobs)
+
+
+def _replayed(
+    jobs: Sequence[_Job], clock: Clock, services: Sequence[Service], policy: Policy
+) -> Iterator[Run]:
+    schedules = simulate_lanes([len(job) for job in jobs], clock, services, policy)
+    return (job.run(schedule) for job, schedule in zip(jobs, schedules))
+
+
+def _jobs(trace: Trace, timing: Trace | None, strided: Sequence[Trace] = ()) -> Iterator[_Job]:
+    """Each recording of a trace with those of the same name in other traces."""
+    times = None if timing is None else _finder(timing, "the trace of the times")
+    passes = {
+        other.metadata.stride: _finder(other, f"the pass of stride {other.metadata.stride}")
+        for other in strided
+    }
+    stride = trace.metadata.stride
+    if stride in passes or len(passes) != len(strided):
+        raise LaeError("two of the passes have the same stride: give each stride once")
+    for recording in trace:
+        yield _Job(
+            recording,
+            recording if times is None else times(recording.name),
+            {other: find(recording.name) for other, find in passes.items()},
+            stride,
+        )
+
+
+def _finder(trace: Trace, what: str) -> Callable[[str], Recording]:
+    """Finds recordings by names that are asked for in the order of the trace, sorted."""
+    recordings = iter(trace)
+
+    def find(name: str) -> Recording:
+        for recording in recordings:
+            if recording.name >= name:
+                break
+        else:
+            recording = None
+        if recording is None or recording.name != name:
+            raise LaeError(f"{what} has no sequence {name!r}")
+        return recording
+
+    return find

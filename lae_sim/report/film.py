@@ -1,0 +1,222 @@
+"""Boxes and captions drawn on frames, with OpenCV."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim._arrays import Floats
+from lae_sim.boxes import iou
+from lae_sim.datasets.frames import Image
+from lae_sim.errors import LaeError
+
+if TYPE_CHECKING:
+    from lae_sim.datasets.frames import Image, ImageSequence
+    from lae_sim.evaluation.evaluate import Answers
+    from lae_sim.forecast.base import AnyFactory
+    from lae_sim.replay.run import Run
+    from lae_sim.trace.metadata import Metadata
+
+WHITE, DARK = (255, 255, 255), (24, 24, 24)
+COLOURS = (
+    (0, 159, 230),  # orange
+    (233, 180, 86),  # sky blue
+    (66, 228, 240),  # yellow
+    (115, 158, 0),  # bluish green
+    (167, 121, 204),  # reddish purple
+    (0, 94, 213),  # vermilion
+)
+"""Blue, green, red; the colours of Okabe and Ito, "Color Universal Design" (2008)."""
+
+Colour = tuple[int, int, int]
+
+
+def draw_frame(
+    image: Image,
+    boxes: Mapping[str, npt.ArrayLike],
+    truth: npt.ArrayLike | None = None,
+    caption: Sequence[str] = (),
+    width: int | None = None,
+) -> Image:
+    """Draw boxes on a copy of a frame, and what they are below it.
+
+    The truth is white; the others have `COLOURS` in their order, and their IoU with the truth.
+
+    Args:
+        image: uint8 [H, W, 3].
+        boxes: ``x, y, w, h`` in pixels by name; NaN = none.
+        truth: the ground truth, likewise.
+        caption: words to put below.
+        width: of the picture, pixels; by default the image's, but at least 640.
+    """
+    import cv2
+
+    width = width or max(image.shape[1], 640)
+    scale = width / image.shape[1]
+    size = width, max(round(image.shape[0] * scale), 1)
+    shrink = scale < 1
+    picture = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
+    line = max(width // 320, 1)
+    shown = [] if truth is None else [("truth", _row(truth), WHITE)]
+    for number, (name, box) in enumerate(boxes.items()):
+        shown.append((name + _overlap(truth, box), _row(box), COLOURS[number % len(COLOURS)]))
+    for _, row, colour in shown:
+        if np.isfinite(row).all():
+            corners = np.concatenate([row[:, :2], row[:, :2] + row[:, 2:]]) * scale
+            low, high = map(tuple, np.clip(np.rint(corners), -(2**14), 2**14).astype(int).tolist())
+            cv2.rectangle(picture, low, high, (0, 0, 0), line + max(line // 2, 2), cv2.LINE_AA)
+            cv2.rectangle(picture, low, high, colour, line, cv2.LINE_AA)
+    lines = [[(text, WHITE) for text in caption], [(text, colour) for text, _, colour in shown]]
+    bands = [_line(items, width) for items in lines if items]
+    return np.concatenate([np.asarray(picture, np.uint8), *bands])
+
+
+def film_strip(pictures: Sequence[Image], columns: int | None = None) -> Image:
+    """Put pictures of one size side by side, row by row.
+
+    Args:
+        pictures: uint8 [H, W, 3] each.
+        columns: pictures in a row; by default so that the strip is about 16:9.
+
+    Raises:
+        LaeError: if there are none, or their sizes differ.
+    """
+    if len({picture.shape for picture in pictures}) != 1:
+        raise LaeError("a film strip needs pictures of one size, and at least one")
+    height, width = pictures[0].shape[:2]
+    across = columns or int(np.ceil(np.sqrt(len(pictures) * height / width * 16 / 9)))
+    gap = max(width // 160, 1)
+    rows = -(-len(pictures) // across)
+    across = columns or -(-len(pictures) // rows)  # as few empty places as can be
+    strip = np.full((rows * (height + gap) - gap, across * (width + gap) - gap, 3), 255, np.uint8)
+    for number, picture in enumerate(pictures):
+        top, left = (number // across) * (height + gap), (number % across) * (width + gap)
+        strip[top : top + height, left : left + width] = picture
+    return strip
+
+
+def _row(box: npt.ArrayLike) -> Floats:
+    return np.asarray(box, np.float64).reshape(1, 4)
+
+
+def _overlap(truth: npt.ArrayLike | None, box: npt.ArrayLike) -> str:
+    if truth is None:
+        return ""
+    none = np.isnan(_row(truth)).any()
+    return " IoU -" if none else f" IoU {iou(_row(truth), _row(box))[0]:.2f}"
+
+
+def _line(items: Sequence[tuple[str, Colour]], width: int) -> Image:
+    """A dark band with words in their colours, smaller where they would not fit."""
+    import cv2
+
+    font, height = cv2.FONT_HERSHEY_SIMPLEX, max(width // 26, 15)
+    lengths = [cv2.getTextSize(f"{text}   ", font, 1.0, 1)[0][0] for text, _ in items]
+    scale = min(height / 44, width / (sum(lengths) + 20))
+    band = np.full((height, width, 3), DARK, np.uint8)
+    for (text, colour), before in zip(items, np.cumsum([20, *lengths])):
+        place = round(scale * before), round(0.72 * height)
+        thick = max(round(1.5 * scale), 1)
+        cv2.putText(band, text, place, font, scale, colour, thick, cv2.LINE_AA)
+    return band
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A replayed sequence with its frames: ``scene.draw(frame)`` is a picture of one.
+
+    Attributes:
+        run: the replayed sequence.
+        images: the same sequence's frames.
+        answers: what each forecaster answers for every world frame, by name.
+    """
+
+    run: Run
+    images: ImageSequence
+    answers: Mapping[str, Answers]
+
+    @classmethod
+    def of(
+        cls,
+        run: Run,
+        images: ImageSequence,
+        metadata: Metadata,
+        forecasters: Mapping[str, AnyFactory],
+        at_arrival: bool = False,
+    ) -> Scene:
+        """The scene of a run and what forecasters make of it (see :func:`.evaluate.answers`).
+
+        Raises:
+            LaeError: if the frames are not as many as the run's.
+        """
+        from lae_sim.evaluation.evaluate import answers
+
+        if len(images) != len(run):
+            raise LaeError(
+                f"sequence {run.recording.name!r} has {len(run)} frames in the trace and "
+                f"{len(images)} images: is this the dataset that it was recorded on?"
+            )
+        found = {
+            name: answers(run, metadata, name, factory, at_arrival=at_arrival)
+            for name, factory in forecasters.items()
+        }
+        return cls(run, images, found)
+
+    def draw(self, frame: int, width: int | None = None) -> Image:
+        """Draw the boxes for a world frame on it; see `lae_sim.report.film.draw_frame`.
+
+        Raises:
+            LaeError: if there is no such frame, or it cannot be read.
+        """
+        last = len(self.run) - 1
+        if not 0 <= frame <= last:
+            raise LaeError(f"sequence {self.run.recording.name!r} has frames 0 to {last}")
+        source = next(iter(self.answers.values())).source_frame[frame]
+        caption = (
+            self.run.recording.name,
+            f"frame {frame} of {last + 1}",
+            f"{self.run.schedule.clock.milliseconds(frame) / 1000:.3f} s",
+            f"output of frame {source}, {frame - source} before",
+        )
+        boxes = {name: found.boxes[frame] for name, found in self.answers.items()}
+        truth = self.run.recording.truth[frame]
+        return draw_frame(self.images.read(frame), boxes, truth, caption, width)
+
+    def film(self, path: str | Path) -> None:
+        """Write an MP4 of all frames, whole or not at all, with a progress bar on a terminal.
+
+        Raises:
+            LaeError: if it cannot be written, or a frame cannot be read.
+        """
+        import cv2
+        import numpy as np
+        from tqdm import trange
+
+        from lae_sim.files import written_whole
+
+        first = self.draw(0)
+        fill = [(0, side % 2) for side in first.shape[:2]] + [(0, 0)]  # codecs need even sides
+        height, width = np.pad(first, fill).shape[:2]
+        fourcc, rate = cv2.VideoWriter.fourcc(*"mp4v"), float(self.run.schedule.clock.fps)
+        with written_whole(path) as temporary:
+            writer = cv2.VideoWriter(str(temporary), fourcc, rate, (width, height))
+            try:
+                for frame in trange(len(self.run), desc=Path(path).name, disable=None):
+                    picture = self.draw(frame)
+                    if picture.shape != first.shape:
+                        raise LaeError(f"{self.images.name!r}, frame {frame}: another image size")
+                    writer.write(np.pad(picture, fill, "edge"))
+            finally:
+                writer.release()
+            written = cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)
+            if written != len(self.run):  # the writer is silent on a full disk, or without a codec
+                raise LaeError(f"{path}: only {written:.0f} of {len(self.run)} frames were written")
+
+    def strip(self, frames: Sequence[int], width: int = 640) -> Image:
+        """Pictures of some frames side by side, each ``width`` pixels wide."""
+        return film_strip([self.draw(frame, width) for frame in frames])

@@ -1,0 +1,210 @@
+"""What ``lae-sim show`` prints for people."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+from lae_sim.report.table import table
+from lae_sim.trace.describe import Report, gathered
+
+if TYPE_CHECKING:
+    from lae_sim.trace.describe import SequenceTimes
+
+_WIDTH, _INDENT, _BAR, _STALLS = 96, 13, 50, 10
+_UNNAMED = ("name", "model", "kind", "source")  # whose values say what they are
+_FIGURES: dict[str, Callable[[Any], float]] = {
+    "CPU clock, MHz": lambda taken: taken["cpu_mhz"]["highest"],
+    "CPU clock allowed": lambda taken: taken["cpu_mhz"]["allowed"],
+    "GPU clock, MHz": lambda taken: taken["gpu_mhz"]["highest"],
+    "hottest zone, C": lambda taken: max(taken["temperatures_c"].values()),
+    "load, 1 minute": lambda taken: taken["load"][0],
+}
+
+
+def overview(report: Mapping[str, Any]) -> str:
+    """A trace's report (see ``lae_sim.trace.describe.describe``) in lines that fit the terminal."""
+    provenance, times, failures = report["provenance"], report["times"], report["failures"]
+    lines = [_words(report["trace"]), ""]
+    for key in dict.fromkeys(["tracker", "device", "timing", "schedule", "dataset", *provenance]):
+        if key in provenance:
+            lines += _section(key, provenance[key])
+    lines.append(_entry("frames", _frames(report)))
+    if failures:
+        lines.append(_entry("failures", f"{len(failures)}: {_words(failures[:5])}"))
+    lines += [*_readings(provenance.get("device")), "", *_times(times)]
+    if times["histogram"]:
+        lines += ["", *_histogram(times["histogram"])]
+    lines += ["", *_drift(times), *_stalls(times["stalls"])]
+    return "\n".join(lines + [_entry("warning", text) for text in report["warnings"]]).rstrip()
+
+
+def _entry(label: str, value: Any) -> str:
+    label = _words(label.replace("_", " "))[: _INDENT - 1].ljust(_INDENT)
+    width = max(60, min(_WIDTH, shutil.get_terminal_size((_WIDTH, 24)).columns))
+    words = textwrap.shorten(_words(value), 1000)
+    return textwrap.fill(words, width, initial_indent=label, subsequent_indent=" " * _INDENT)
+
+
+def _section(label: str, section: Any) -> list[str]:
+    """A value of the metadata; the objects in it on lines of their own."""
+    if not isinstance(section, dict):
+        return [_entry(label, section)]
+    inner = {key: value for key, value in section.items() if isinstance(value, dict) and value}
+    lines = [_entry(label, {key: value for key, value in section.items() if key not in inner})]
+    return lines + [_entry(f"  {key}", inner[key]) for key in inner if key != "readings"]
+
+
+def _words(value: Any, depth: int = 0) -> str:
+    """A JSON value in words that are safe to print, whatever is in it."""
+    if depth > 4:
+        return "..."
+    if isinstance(value, dict):
+        keys = sorted(value, key=lambda key: key not in _UNNAMED)
+        return ", ".join(_item(k, value[k], depth) for k in keys if value[k] is not None)
+    if isinstance(value, list):
+        return "; ".join(_words(item, depth + 1) for item in value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    text = re.sub(r"\b([0-9a-f]{12})[0-9a-f]{8,}\b", r"\1...", str(value)[:300])
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def _item(key: str, value: Any, depth: int) -> str:
+    name = _words(key.replace("_", " "))
+    if isinstance(value, bool):
+        return name if value else f"not {name}"
+    if key.endswith("_bytes") and isinstance(value, int) and abs(value) < 2**63:
+        return f"{name[:-6]} {value / 2**30:.1f} GiB"
+    words = _words(value, depth + 1)
+    return words if key in _UNNAMED else f"{name} {words}"
+
+
+def _frames(report: Mapping[str, Any]) -> str:
+    frames, processed = report["world_frames"], report["processed"]
+    parts = [
+        f"{frames:,} in {report['sequences']:,} sequences at {report['fps']} fps",
+        "all processed" if processed == frames else f"{processed:,} processed",
+        "all with truth" if report["with_truth"] == frames else f"{report['with_truth']:,} truths",
+    ]
+    sizes = [size for size in report["image_sizes"] if size != "unknown"]
+    if sizes:
+        parts.append(", ".join(sizes[:4]) + (" and others" if len(sizes) > 4 else "") + " px")
+    if report["lost"] is not None:
+        parts.append(f"target not found in {report['lost']:,}")
+    return "; ".join(parts)
+
+
+def _readings(device: Any) -> list[str]:
+    """Clocks, temperatures and load before, during and after; nothing where there are none."""
+    # another program may have written anything there
+    found = gathered(taken=lambda: dict(device["readings"])).get("taken", {})
+    rows = []
+    for name, figure in _FIGURES.items():
+        cells = [_range(found.get(when), figure) for when in ("before", "during", "after")]
+        rows += [[name, *cells]] if any(cells) else []
+    header = ["readings", "before", "during", "after"]
+    return ["", *table(header, rows, left=1).splitlines()] if rows else []
+
+
+def _range(taken: Any, figure: Callable[[Any], float]) -> str:
+    """The lowest and highest value of a figure in one reading or several."""
+    values: list[float] = []
+    for one in taken if isinstance(taken, list) else [taken]:
+        values += gathered(value=lambda one=one: float(figure(one))).values()  # type: ignore[misc]
+    return " to ".join(dict.fromkeys(map(_figure, [min(values), max(values)]))) if values else ""
+
+
+def _times(times: Mapping[str, Any]) -> list[str]:
+    names = ("mean_ms", "median_ms", "p90_ms", "p95_ms", "p99_ms", "max_ms", "fps")
+    rows = [
+        [kind, f"{found['n']:,}", *(_figure(found.get(name)) for name in names)]
+        for kind in ("calls", "initialisations")
+        if (found := times[kind])["n"]
+    ]
+    header = ["times, ms", "n", *(name.removesuffix("_ms") for name in names)]
+    share, interval = 100 * times["slower_than_frames"], _figure(times["frame_interval_ms"])
+    late = f"{share:.3g}% of the calls take longer than the interval between frames, {interval} ms"
+    return [*table(header, rows, left=1).splitlines(), late]
+
+
+def _figure(value: float | None) -> str:
+    """Three digits, or all before the point."""
+    if value is None:
+        return "-"
+    return f"{value:,.{max(0, min(3, 2 - math.floor(math.log10(abs(value) or 1))))}f}"
+
+
+def _histogram(found: Mapping[str, Any]) -> list[str]:
+    edges = [f"{edge:g}" for edge in found["edges_ms"]]
+    labels = [f"< {edges[0]}", *(f"{a} - {b}" for a, b in pairwise(edges)), f"> {edges[-1]}"]
+    counts = [found["below"], *found["counts"], found["above"]]
+    most, wide = max(counts), max(map(len, labels))
+    lines = [f"{'ms':>{wide}}  {'calls':>9}"]
+    for label, n in zip(labels, counts):
+        bar = "#" * -(-_BAR * n // most)  # what is there is seen
+        lines.append(f"{label:>{wide}}  {n:>9,}  {bar}".rstrip())
+    return lines
+
+
+def _drift(times: Mapping[str, Any]) -> list[str]:
+    drift = times["drift"]
+    if not drift:
+        return []
+    order = "" if times["order_known"] else " (sequences by name: their order is unknown)"
+    chance = " (within chance)" if drift["ratio"] > 1.1 and not drift["slower"] else ""
+    return [
+        f"medians of tenths of the run, ms{order}",
+        f"  {'  '.join(map(_figure, drift['tenths_ms']))}",
+        f"last third to first: {drift['ratio']:.2f}{chance}",
+        "",
+    ]
+
+
+def _stalls(stalls: list[dict[str, Any]]) -> list[str]:
+    if not stalls:
+        return []
+    lines = [f"stalls: {len(stalls):,} calls took over 10 x the median of run and sequence"]
+    listed = sorted(stalls, key=lambda stall: bool(stall["first_call"]))
+    for stall in listed[:_STALLS]:
+        note = ": first call after initialisation" if stall["first_call"] else ""
+        where = f"{_words(stall['sequence'])}, frame {stall['frame']:,}"
+        lines.append(f"{_figure(stall['ms']):>10} ms  {where}{note}")
+    if left := listed[_STALLS:]:
+        first = sum(stall["first_call"] for stall in left)
+        lines.append(f"{'...':>10}     and {len(left):,} more, {first:,} of them first calls")
+    return [*lines, ""]
+
+
+def plot_times(found: Sequence[tuple[Report, Sequence[SequenceTimes]]], path: str) -> None:
+    """Draw, for each trace, a histogram of its times, and the times over the run."""
+    from matplotlib.figure import Figure
+
+    from lae_sim.report import figures as plots
+
+    figure = Figure(figsize=(11, 3.6 * len(found)), layout="constrained")
+    rows = figure.subplots(len(found), 2, squeeze=False, width_ratios=(1, 2))
+    for (left, right), (report, sequences) in zip(rows, found):
+        times = report["times"]
+        if histogram := times["histogram"]:
+            left.stairs(histogram["counts"], histogram["edges_ms"], fill=True)
+            outside = histogram["below"] + histogram["above"]
+            left.set_title(f"{outside:,} of {times['calls']['n']:,} calls are outside", fontsize=9)
+            calls = times["calls"]
+            right.set_yscale("log" if calls["max_ms"] > 5 * calls["median_ms"] else "linear")
+        left.set(xlabel="time (ms)", ylabel="calls")
+        start = 0
+        for number, sequence in enumerate(sequences):
+            places = range(start, start := start + len(sequence.elapsed_ns))
+            ms, colour = sequence.elapsed_ns / 1e6, f"C{number % 2 * 9}"
+            right.plot(places, ms, ".", ms=1.5, color=colour, rasterized=True)
+        order = "as they were run" if times["order_known"] else "in order of their names"
+        right.set(xlabel=f"calls, sequences {order}", ylabel="time (ms)")
+        right.axhline(times["frame_interval_ms"], color="tab:red", ls="--", lw=1)
+        right.set_title(f"{report['trace']} (dashed: the interval between frames)", fontsize=9)
+    plots.save(figure, path)

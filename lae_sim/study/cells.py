@@ -1,0 +1,347 @@
+"""The cells of a study: one forecaster and convention on one replay of one trace.
+
+A cell is named by a digest of all that its figures depend on, so that a finished one is found
+again, and one whose input has changed is not. Cells of the same replay are computed together.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from fractions import Fraction
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lae_sim import __version__
+from lae_sim._arrays import Ints
+from lae_sim.engine.lanes import batchable
+from lae_sim.evaluation.caveats import notes_on
+from lae_sim.evaluation.evaluate import Evaluation, evaluate_groups
+from lae_sim.evaluation.metrics import METRICS, find_convention
+from lae_sim.forecast.base import AnyFactory
+from lae_sim.forecast.costs import cost_notes
+from lae_sim.replay.latency import LatencySource, RandomSource, bootstrap, scaled
+from lae_sim.replay.run import Run, replay_repeated, replay_trace
+from lae_sim.replay.world import parse_latency, parse_policy
+from lae_sim.study.rows import CellRows
+from lae_sim.study.spec import RANDOM
+from lae_sim.trace.file import Trace, held, read_trace
+from lae_sim.trace.metadata import Metadata
+
+VERSION = 1
+"""Of the cells' files; another version is another cell."""
+
+GROUP = 1 << 17
+"""World frames that are scored at once."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """A trace that a study reads.
+
+    Attributes:
+        path: file or URL.
+        label: its name in tables.
+        digest: SHA-256 of its content.
+        stamp: size and time of a local file when the digest was taken; empty of any other.
+    """
+
+    path: str
+    label: str
+    digest: str
+    stamp: str = ""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to replay one trace.
+
+    Attributes:
+        trace: the boxes and the truth.
+        timing: another device's trace that the times come from.
+        code: of a user's own policy or latency, a digest of its file.
+        policy, latency: names.
+        fps: world frame rate.
+        scale: exact factor on all times.
+        first, count: which repetitions of a random latency; 0 and 1 of any other.
+        seed, block: of a random latency.
+        sigmas: permitted latencies, frames, ascending.
+        sequences: those wanted; all if empty.
+    """
+
+    trace: Input
+    timing: Input | None
+    code: str
+    policy: str
+    fps: Fraction
+    latency: str
+    scale: Fraction
+    first: int
+    count: int
+    seed: int
+    block: int
+    sigmas: tuple[Fraction, ...]
+    sequences: tuple[str, ...]
+
+    @property
+    def run(self) -> str:
+        """The trace's label, and that of the one whose times it takes, if it is another."""
+        return self.trace.label + ("" if self.timing is None else f" at {self.timing.label}")
+
+    def columns(self) -> dict[str, str]:
+        """What names the replay in tables."""
+        return {
+            "trace": self.trace.label,
+            "times_from": (self.timing or self.trace).label,
+            "policy": self.policy,
+            "fps": str(self.fps),
+            "latency": self.latency,
+            "scale": str(self.scale),
+        }
+
+    def document(self) -> dict[str, Any]:
+        """Plain values of all that the rows depend on: labels and contents of files, not paths."""
+        return {
+            "trace": [self.trace.label, self.trace.digest],
+            "timing": self.timing and [self.timing.label, self.timing.digest],
+            "code": self.code,
+            "policy": self.policy,
+            "fps": str(self.fps),
+            "latency": self.latency,
+            "scale": str(self.scale),
+            "first": self.first,
+            "count": self.count,
+            "seed": self.seed,
+            "block": self.block,
+            "sigmas": [str(sigma) for sigma in self.sigmas],
+            "sequences": list(self.sequences),
+        }
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One forecaster and convention on one replay.
+
+    Attributes:
+        setting: the replay.
+        forecaster: its name.
+        code: what else it depends on: a digest of its file or of its training.
+        cost_ns: what an answer costs.
+        convention: how frames and thresholds count.
+    """
+
+    setting: Setting
+    forecaster: str
+    code: str
+    cost_ns: int
+    convention: str
+
+    @cached_property
+    def key(self) -> str:
+        """Digest of all that the figures depend on."""
+        document = {
+            "lae_sim": __version__,
+            "version": VERSION,
+            "setting": self.setting.document(),
+            "forecaster": self.forecaster,
+            "code": self.code,
+            "cost_ns": self.cost_ns,
+            "convention": self.convention,
+        }
+        return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:32]
+
+    def about(self, metadata: Metadata) -> dict[str, str]:
+        """The columns that are the same in all its rows."""
+        return {
+            **self.setting.columns(),
+            "tracker": metadata.tracker,
+            "dataset": metadata.dataset,
+            "convention": self.convention,
+            "forecaster": self.forecaster,
+        }
+
+
+@dataclass(frozen=True)
+class Task:
+    """Cells of one replay, to be computed together.
+
+    Attributes:
+        cells: of the same setting.
+        factories: their forecasters, by name.
+    """
+
+    cells: tuple[Cell, ...]
+    factories: Mapping[str, AnyFactory]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What was computed of a cell.
+
+    Attributes:
+        key: the cell's.
+        rows: a Parquet file (see :mod:`lae_sim.study.rows`).
+        about: curves at the first sigma, how many outputs are approximate, the engine, notes.
+    """
+
+    key: str
+    rows: bytes
+    about: dict[str, Any]
+
+
+def compute(task: Task) -> list[Result]:
+    """Replay once for each convention, and score.
+
+    Raises:
+        LaeError: whatever replaying and scoring raise.
+    """
+    conventions = dict.fromkeys(cell.convention for cell in task.cells)
+    return [
+        result
+        for convention in conventions
+        for result in _computed(
+            [cell for cell in task.cells if cell.convention == convention], task.factories
+        )
+    ]
+
+
+def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> list[Result]:
+    """The results of cells of one setting and one convention."""
+    setting, convention = cells[0].setting, find_convention(cells[0].convention)
+    trace = held(read_trace(setting.trace.path, setting.sequences or None))
+    chosen = {cell.forecaster: factories[cell.forecaster] for cell in cells}
+    costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
+    writers = [CellRows(setting.sigmas, cell.about(trace.metadata)) for cell in cells]
+    replay = replayed(setting, trace)
+    repetitions: list[int] = []
+
+    def runs() -> Iterator[Run]:
+        for repetition, run in replay.runs:
+            repetitions.append(repetition)
+            yield run
+
+    curves, kept = _Curves(), []
+    departures = calls = 0
+    for part in evaluate_groups(
+        runs(), trace.metadata, chosen, setting.sigmas, convention, costs=costs, frames=GROUP
+    ):
+        of_part = np.array(repetitions[: len(part.sequences)], np.int32)
+        del repetitions[: len(part.sequences)]
+        for f, writer in enumerate(writers):
+            writer.add(part, f, of_part)
+        curves.add(part)
+        departures += int(part.departures.sum())
+        calls += int((part.processed - 1).sum())
+        kept.append(_without_scores(part, np.flatnonzero(of_part == setting.first)))
+    about = Evaluation.joined(kept)
+    results = []
+    for f, (cell, writer) in enumerate(zip(cells, writers)):
+        only = {cell.forecaster: chosen[cell.forecaster]}
+        details = {
+            "engine": replay.engine,
+            "repetitions": setting.count,
+            "curves": curves.means(f),
+            "approximate_outputs": departures,
+            "calls": calls,
+            "notes": [
+                *notes_on(about, trace.metadata, convention, only, at_arrival=False),
+                *cost_notes({cell.forecaster: cell.cost_ns} if cell.cost_ns else {}),
+            ],
+        }
+        results.append(Result(cell.key, writer.finish(), details))
+    return results
+
+
+def _without_scores(part: Evaluation, kept: Ints) -> Evaluation:
+    """Some sequences of a part without their scores: what notes are about."""
+    none = np.zeros((1, len(kept), 0))
+    scored = ("scores", "failure", "success", "precision")
+    offline = ("offline", "offline_success", "offline_precision")
+    columns: dict[str, Any] = {
+        field.name: getattr(part, field.name)[kept]
+        for field in fields(part)
+        if field.name not in ("sequences", *scored, *offline)
+    }
+    return Evaluation(
+        sequences=tuple(part.sequences[s] for s in kept),
+        scores=dict.fromkeys(METRICS, none),
+        failure=none.astype(np.int64),
+        success=none,
+        precision=none,
+        offline={metric: values[kept] for metric, values in part.offline.items()},
+        offline_success=none[0],
+        offline_precision=none[0],
+        **columns,
+    )
+
+
+class _Curves:
+    """Mean success and precision curves over sequences and repetitions, at the first sigma."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, Any] = {}
+        self._counts: dict[str, Any] = {}
+
+    def add(self, part: Evaluation) -> None:
+        offline = part.offline_success[None], part.offline_precision[None]
+        named = {
+            "success": np.concatenate([part.success, offline[0]]),
+            "precision": np.concatenate([part.precision, offline[1]]),
+        }
+        for name, curves in named.items():
+            self._sums[name] = self._sums.get(name, 0) + np.nansum(curves, axis=1)
+            known = (~np.isnan(curves[:, :, 0])).sum(axis=1)
+            self._counts[name] = self._counts.get(name, 0) + known
+
+    def means(self, f: int) -> dict[str, list[float] | None]:
+        """Those of a forecaster, and offline."""
+        found: dict[str, list[float] | None] = {}
+        for name, sums in self._sums.items():
+            for label, which in ((name, f), (f"offline_{name}", -1)):
+                count = int(self._counts[name][which])
+                found[label] = (sums[which] / count).tolist() if count else None
+        return found
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """The runs of a setting.
+
+    Attributes:
+        runs: repetition and run, as they are made.
+        engine: ``"batch"``, or ``"simpy"`` where the policy or the source of times knows no lanes.
+    """
+
+    runs: Iterable[tuple[int, Run]]
+    engine: str
+
+
+def replayed(setting: Setting, trace: Trace) -> Replayed:
+    """Replay a setting: its sequences and repetitions at once, where that is possible.
+
+    Args:
+        setting: which trace, and how.
+        trace: the setting's, as it was read.
+    """
+    timing = None if setting.timing is None else read_trace(setting.timing.path)
+    policy, _ = parse_policy(setting.policy)
+    source = scaled(_source(setting), setting.scale)
+    times = source(next(iter(timing or trace)))
+    engine = "batch" if batchable([times], policy) else "simpy"
+    if isinstance(source, RandomSource):
+        where = (source, setting.count, setting.fps, policy, timing, setting.first)
+        return Replayed(replay_repeated(trace, *where), engine)
+    runs = replay_trace(trace, setting.fps, source, policy, timing, batch=True)
+    return Replayed(((0, run) for run in runs), engine)
+
+
+def _source(setting: Setting) -> LatencySource:
+    if setting.latency == "bootstrap":
+        return bootstrap(setting.seed, setting.block)
+    if setting.latency in RANDOM:
+        return parse_latency(f"{setting.latency}:{setting.seed}")
+    return parse_latency(setting.latency)

@@ -1,0 +1,122 @@
+"""Computing the cells of a study: on this machine's cores, or on a Dask cluster; resumable."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any, TypeVar
+
+from lae_sim.errors import LaeError
+
+AHEAD = 3
+"""Tasks that are handed out for each worker, so that none waits and few results are held."""
+
+Item = TypeVar("Item")
+_GOES_ON = "what is finished is kept, and the same command goes on from there"
+
+
+def run_all(
+    work: Callable[[Item], Any],
+    items: Iterable[Item],
+    executor: Executor | None = None,
+    workers: Callable[[], int] = lambda: 1,
+) -> Iterator[tuple[Item, Any]]:
+    """Each item with what a function makes of it, as they are finished.
+
+    Args:
+        work: a function of a module, that workers can import.
+        items: handed out as workers become free.
+        executor: where it runs; in this process if None.
+        workers: how many there are at the moment.
+
+    Raises:
+        LaeError: if a worker died, and nobody takes its place.
+    """
+    if executor is None:
+        for item in items:
+            yield item, work(item)
+        return
+    waiting = iter(items)
+    running: dict[Future[Any], Item] = {}
+    try:
+        while True:
+            for item in islice(waiting, max(AHEAD * workers() - len(running), 0)):
+                running[executor.submit(work, item)] = item
+            if not running:
+                return
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield running.pop(future), future.result()
+    except BrokenExecutor as error:
+        raise LaeError(
+            "a worker died, for want of memory or, in a script, of 'if __name__ == \"__main__\":': "
+            + _GOES_ON
+        ) from error
+    except (LaeError, OSError):
+        raise
+    except Exception as error:  # whatever a cluster has to say: a worker lost too often, an import
+        told = " ".join(str(error).split())[:300]
+        raise LaeError(f"a worker failed, {type(error).__name__}: {told}; {_GOES_ON}") from error
+    finally:
+        for future in running:
+            future.cancel()
+
+
+@contextmanager
+def local_executor(workers: int) -> Iterator[Executor]:
+    """Worker processes on this machine."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    # not a fork: libraries here have threads
+    start = (get_context("spawn"), _begin, (os.getpid(),))
+    with ProcessPoolExecutor(workers, *start) as executor:
+        try:
+            yield executor
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            for process in list((getattr(executor, "_processes", None) or {}).values()):
+                process.terminate()  # or the end would wait for what they are doing
+            raise
+
+
+def _begin(parent: int) -> None:
+    """Begin a worker: Ctrl-C is for its parent alone, and it ends with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def cluster_executor(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    """An existing Dask cluster, and how many threads it has at the moment.
+
+    Raises:
+        LaeError: if Dask is not installed, or there is no scheduler at the address.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise LaeError(
+            "--scheduler needs Dask: pip install 'lae-sim[distributed]', here and on the workers"
+        ) from error
+    try:
+        client = Client(address, timeout=5, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise LaeError(f"no Dask scheduler at {address}: {error}") from error
+    with client:
+        yield (
+            client.get_executor(pure=False, retries=2),
+            lambda: max(1, sum(client.nthreads().values())),
+        )

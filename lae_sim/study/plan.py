@@ -1,0 +1,204 @@
+"""The plan of a study: its traces as they are found, and the cells that it is made of."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+from lae_sim.comparison.forecasters import fitted
+from lae_sim.errors import LaeError
+from lae_sim.files import labels
+from lae_sim.forecast.base import AnyFactory, Hold
+from lae_sim.forecast.costs import resolve_costs
+from lae_sim.learning.folds import Trainer
+from lae_sim.learning.registry import load_any
+from lae_sim.replay.world import World, parse_latency, parse_policy
+from lae_sim.study.cells import Cell, Input, Setting, Task
+from lae_sim.study.spec import RANDOM, Study
+from lae_sim.trace.file import read_trace
+from lae_sim.trace.locate import digest, find_traces, stamp
+from lae_sim.trace.metadata import Metadata
+
+CHUNK_FRAMES = 2_000_000
+"""World frames that a task replays, at most, where repetitions can be dealt out."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A trace of a study.
+
+    Attributes:
+        input: the file.
+        metadata: what it says of itself.
+        frames: world frames of all its sequences.
+    """
+
+    input: Input
+    metadata: Metadata
+    frames: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a study computes.
+
+    Attributes:
+        study: what was asked for.
+        sources: its traces, and those of other devices' times.
+        cells: in the order of the tables.
+        forecasters: factories by name, and trainers of those that must be trained.
+        training: digest of all that the training depends on.
+    """
+
+    study: Study
+    sources: tuple[Source, ...]
+    cells: tuple[Cell, ...]
+    forecasters: Mapping[str, AnyFactory | Trainer]
+    training: str
+
+    @property
+    def trainers(self) -> list[str]:
+        """Names of the forecasters that must be trained."""
+        return [name for name, each in self.forecasters.items() if isinstance(each, Trainer)]
+
+    def trained(
+        self, progress: Callable[[str], object] = lambda what: None
+    ) -> tuple[dict[str, AnyFactory], list[str]]:
+        """Train, across folds, on replays with the recorded and constant times of the study.
+
+        Returns:
+            A factory for each forecaster, and what to say of the training.
+        """
+        study, wanted = self.study, self.study.sequences or None
+        own = {cell.setting.trace: None for cell in self.cells}
+        read = {each.label: read_trace(each.path, wanted) for each in own}
+        fixed = [name for name in study.latencies if name not in RANDOM] or ["recorded"]
+        world = World(
+            {name: parse_latency(name) for name in fixed},
+            study.scales,
+            study.fps[0],
+            parse_policy(study.policies[0])[0],
+        )
+        return fitted(read, self.forecasters, world, study.folds, study.seed, progress)
+
+
+def make_plan(study: Study, base: Path | None = None) -> Plan:
+    """Find the traces, and list the cells.
+
+    Args:
+        study: what is asked for.
+        base: the folder that relative paths are from; the current one by default.
+
+    Raises:
+        LaeError: if a trace is missing or damaged, or there is no such forecaster.
+    """
+    own, timed = find_traces(study.traces, base), find_traces(study.timing, base)
+    paths = list(dict.fromkeys([*own, *timed]))
+    sources = {}
+    for path, label in zip(paths, labels([path.removesuffix(".parquet") for path in paths])):
+        trace = read_trace(path)
+        found = Input(path, label, digest(path), stamp(path))
+        sources[path] = Source(found, trace.metadata, trace.frames or 0)
+    traces, timing = [sources[path] for path in own], [sources[path] for path in timed]
+    for other in timing:
+        if not any(_same_runs(source, other) for source in traces):
+            metadata = other.metadata
+            raise LaeError(
+                f"timing: {other.input.path} is of {metadata.tracker} on {metadata.dataset}: none "
+                "of the traces is of the same tracker and dataset on another device"
+            )
+    names = dict.fromkeys(["hold", *study.forecasters])
+    forecasters = {name: load_any(name) for name in names}
+    training = _training(study, traces)
+    codes = {name: _code(name, each, training) for name, each in forecasters.items()}
+    costs = resolve_costs(study.costs, dict.fromkeys(names, Hold), ())  # none is measured
+    cells = [
+        Cell(setting, name, codes[name], costs.get(name, 0), convention)
+        for source in traces
+        for setting in _settings(study, source, timing)
+        for convention in study.conventions
+        for name in forecasters
+    ]
+    return Plan(study, tuple(sources.values()), tuple(cells), forecasters, training)
+
+
+def tasks(cells: Iterable[Cell], factories: Mapping[str, AnyFactory]) -> list[Task]:
+    """The cells of each setting together."""
+    together: dict[Setting, list[Cell]] = {}
+    for cell in cells:
+        together.setdefault(cell.setting, []).append(cell)
+    return [
+        Task(tuple(some), {cell.forecaster: factories[cell.forecaster] for cell in some})
+        for some in together.values()
+    ]
+
+
+def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Setting]:
+    """All ways in which a trace is replayed."""
+    theirs = [other.input for other in timing if _same_runs(source, other)]
+    codes = {name: _own_code(name) for name in (*study.policies, *study.latencies)}
+    rates = dict.fromkeys(source.metadata.fps if fps is None else fps for fps in study.fps)
+    found = []
+    for times, policy, fps, latency, scale in product(
+        [None, *theirs], study.policies, rates, study.latencies, study.scales
+    ):
+        chunk = max(1, CHUNK_FRAMES // (max(source.frames, 1) * max(1, len(study.sigmas) // 8)))
+        random = latency in RANDOM
+        setting = Setting(
+            trace=source.input,
+            timing=times,
+            code=codes[policy] + codes[latency],
+            policy=policy,
+            fps=fps,
+            latency=latency,
+            scale=scale,
+            first=0,
+            count=1,
+            seed=study.seed if random else 0,
+            block=study.block if latency == "bootstrap" else 0,
+            sigmas=study.sigmas,
+            sequences=tuple(sorted(study.sequences)),
+        )
+        repetitions = study.repetitions if random else 1
+        found += [
+            replace(setting, first=first, count=min(chunk, repetitions - first))
+            for first in range(0, repetitions, chunk)
+        ]
+    return found
+
+
+def _same_runs(source: Source, other: Source) -> bool:
+    """Whether two traces are of one tracker on one dataset, on different devices."""
+    ours, theirs = source.metadata, other.metadata
+    same = (ours.tracker, ours.dataset) == (theirs.tracker, theirs.dataset)
+    return same and source.input.path != other.input.path
+
+
+def _training(study: Study, traces: Sequence[Source]) -> str:
+    """Digest of what trained forecasters depend on."""
+    document = study.document()
+    keys = ("latencies", "scales", "fps", "policies", "sequences", "folds", "seed")
+    told = [*(document[key] for key in keys), *(source.input.digest for source in traces)]
+    return hashlib.sha256(repr(told).encode()).hexdigest()[:32]
+
+
+def _code(name: str, forecaster: AnyFactory | Trainer, training: str) -> str:
+    """What else a forecaster's figures depend on: its file, its code, its training."""
+    kind, _, value = name.partition(":")
+    if kind == "learned" and value:
+        return digest(value)
+    return (training if isinstance(forecaster, Trainer) else "") + _own_code(name)
+
+
+def _own_code(name: str) -> str:
+    """Digest of the file of a plug-in ``package.module:object``; empty of what is not one.
+
+    It must have been imported. (Of the package itself, the version says what is needed.)
+    """
+    module = sys.modules.get(name.rpartition("+")[2].partition(":")[0])
+    path = getattr(module, "__file__", None)
+    return digest(path) if path else ""

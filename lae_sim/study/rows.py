@@ -1,0 +1,120 @@
+"""The rows of a study's cells: every score of every sequence, repetition and sigma."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim.errors import LaeError
+from lae_sim.evaluation.evaluate import Evaluation
+from lae_sim.evaluation.metrics import METRICS
+from lae_sim.trace.columns import from_numpy, from_texts
+
+COLUMNS = {
+    "trace": "string",
+    "tracker": "string",
+    "dataset": "string",
+    "times_from": "string",
+    "policy": "string",
+    "fps": "string",
+    "latency": "string",
+    "scale": "string",
+    "convention": "string",
+    "forecaster": "string",
+    "sequence": "string",
+    "repetition": "int32",
+    "sigma": "float64",
+    "world_frames": "int32",
+    "processed": "int32",
+    "approximate_outputs": "int32",
+    "elapsed_ms": "float64",
+    "mismatch_mean": "float64",
+    "mismatch_max": "int32",
+    "longest_hold": "int32",
+    "failure_frame": "int32",
+    **dict.fromkeys(METRICS, "float64"),
+    **{f"offline_{metric}": "float64" for metric in METRICS},
+}
+"""Columns of the results, and their types.
+
+``elapsed_ms`` is the mean time of the calls but the initialisation, ``longest_hold`` and the
+mismatches are in frames, ``failure_frame`` is the first whose answer does not overlap the truth
+(``world_frames`` if there is none); scores are in 0..1, NaN where the sequence leaves the mean or,
+offline, where the trace lacks boxes.
+"""
+
+
+class CellRows:
+    """Writes the rows of one cell, group after group, as a Parquet file in memory."""
+
+    def __init__(self, sigmas: Sequence[Fraction], about: Mapping[str, str]) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        self._sigmas = np.array([float(sigma) for sigma in sigmas])
+        self._about = about
+        self._schema = pa.schema([pa.field(name, kind) for name, kind in COLUMNS.items()])
+        self._file = io.BytesIO()
+        texts = [name for name, kind in COLUMNS.items() if kind == "string"]
+        self._writer = pq.ParquetWriter(
+            self._file, self._schema, compression="zstd", use_dictionary=texts
+        )
+
+    def add(self, part: Evaluation, f: int, repetitions: npt.NDArray[np.int32]) -> None:
+        """Add a row for each sequence of a part and each sigma."""
+        import pyarrow as pa
+
+        count = len(self._sigmas)
+        calls = np.where(part.processed > 1, part.processed - 1, np.nan)
+        once: dict[str, npt.NDArray[Any]] = {  # by sequence
+            "repetition": repetitions,
+            "world_frames": part.frames,
+            "processed": part.processed,
+            "approximate_outputs": part.departures,
+            "elapsed_ms": part.calls_ns / calls / 1e6,
+            **{f"offline_{metric}": part.offline[metric] for metric in METRICS},
+        }
+        values = {name: np.repeat(column, count) for name, column in once.items()}
+        values |= {  # by sequence and sigma
+            "mismatch_mean": (part.mismatch_sum / part.frames[:, None]).ravel(),
+            "mismatch_max": part.mismatch_max.ravel(),
+            "longest_hold": part.longest_hold.ravel(),
+            "failure_frame": part.failure[f].ravel(),
+            **{metric: part.scores[metric][f].ravel() for metric in METRICS},
+        }
+        values["sigma"] = np.tile(self._sigmas, len(part.sequences))
+        rows = len(values["sigma"])
+        columns = {
+            **{name: from_texts([text], rows) for name, text in self._about.items()},
+            "sequence": from_texts(part.sequences, count),
+            **{name: from_numpy(column.astype(COLUMNS[name])) for name, column in values.items()},
+        }
+        arrays = [columns[name] for name in COLUMNS]
+        self._writer.write_batch(pa.record_batch(arrays, schema=self._schema))
+
+    def finish(self) -> bytes:
+        """The file's bytes."""
+        self._writer.close()
+        return self._file.getvalue()
+
+
+def read_rows(path: Path, columns: Sequence[str]) -> Any:
+    """Some columns of a cell's file, as one Arrow table of one chunk.
+
+    Raises:
+        LaeError: if the file is damaged; it says what to do.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            return file.read(columns).combine_chunks()
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise LaeError(f"{path}: damaged: delete it, and run the study again") from error

@@ -1,0 +1,248 @@
+"""Running a study: the plan's cells, on whatever workers there are, and what comes out of them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from lae_sim import __version__
+from lae_sim.errors import LaeError
+from lae_sim.files import written_whole
+from lae_sim.forecast.base import AnyFactory
+from lae_sim.study.cells import Task
+from lae_sim.study.deployment import requirement, searches
+from lae_sim.study.executors import cluster_executor, local_executor, run_all
+from lae_sim.study.plan import Plan, make_plan, tasks
+from lae_sim.study.spec import Study
+from lae_sim.study.store import Store
+from lae_sim.study.summary import Row, Scores, compare_traces, read_scores, summarise_study
+from lae_sim.study.work import Description, Failure, Work, attempt, cell_told, told
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+@dataclass(frozen=True, eq=False)
+class StudyResults:
+    """What a study found.
+
+    Attributes:
+        folder: where it is kept.
+        plan: what was computed.
+        scores: of every finished trace, setting, convention and forecaster.
+        summary: rows (see :func:`lae_sim.study.summary.summarise_study`).
+        comparisons: pairs of traces (see :func:`lae_sim.study.summary.compare_traces`).
+        required: what a required AUC asks for (see :func:`lae_sim.study.deployment.requirement`).
+        traces: what ``lae-sim show --json`` says of each trace.
+        computed: how many cells were computed now, and not found finished.
+        failures: what could not be computed, and why.
+        training: what to say of the forecasters that were trained.
+    """
+
+    folder: Path
+    plan: Plan
+    scores: tuple[Scores, ...]
+    summary: tuple[Row, ...]
+    comparisons: tuple[Row, ...]
+    required: tuple[Row, ...]
+    traces: tuple[Row, ...]
+    computed: int
+    failures: tuple[Row, ...]
+    training: tuple[str, ...] = ()
+
+    def table(self) -> DataFrame:
+        """Every score of every sequence, repetition and sigma (see :mod:`lae_sim.study.rows`)."""
+        import pandas as pd
+
+        store = Store(self.folder)
+        files = [store.rows(cell) for cell in self.plan.cells if store.has(cell)]
+        return pd.concat(map(pd.read_parquet, files), ignore_index=True)
+
+    def notes(self) -> list[str]:
+        """What keeps the figures from being what their names promise, each once."""
+        told = [note for scores in self.scores for about in scores.about for note in about["notes"]]
+        sources = [(source.input.label, source.metadata) for source in self.plan.sources]
+        times = [f"{label}: times: {about.timing_note}" for label, about in sources
+                 if about.timing_note]  # fmt: skip
+        warnings = [f"{trace['trace']}: {text}" for trace in self.traces
+                    for text in trace["warnings"]]  # fmt: skip
+        uneven = [f"{dataset}: its traces do not have the same sequences: compare no means"
+                  for dataset in self._uneven()]  # fmt: skip
+        return list(dict.fromkeys([*uneven, *times, *self.training, *told, *warnings]))
+
+    def _uneven(self) -> list[str]:
+        """Datasets of which some traces have other sequences than others."""
+        found: dict[str, set[tuple[str, ...]]] = {}
+        for scores in self.scores:
+            found.setdefault(scores.source.metadata.dataset, set()).add(scores.sequences)
+        return [dataset for dataset, sequences in found.items() if len(sequences) > 1]
+
+    def document(self) -> dict[str, Any]:
+        """All but the scores of single sequences, as ``study.json`` holds it."""
+        return {
+            "format": "lae-study",
+            "version": "1.0",
+            "lae_sim": __version__,
+            "study": self.plan.study.document(),
+            "cells": len(self.plan.cells),
+            "failures": self.failures,
+            "notes": self.notes(),
+            "summary": self.summary,
+            "comparisons": self.comparisons,
+            "required": self.required,
+            "traces": self.traces,
+        }
+
+
+def run_study(
+    study: Study,
+    folder: str | os.PathLike[str],
+    base: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[str, int, int], object] = lambda what, done, total: None,
+) -> StudyResults:
+    """Compute what is not yet finished, and sum up.
+
+    Args:
+        study: what is asked for.
+        folder: where results are kept; finished cells found there are not computed again.
+        base: the folder that relative paths of traces are from; the current one by default.
+        workers: processes on this machine; by default one for each core. No result depends on it.
+        scheduler: address of a Dask cluster to compute on instead, such as ``tcp://host:8786``;
+            its workers must see the traces under the same paths.
+        progress: told what is going on, how much of it is done, and of how much.
+
+    Raises:
+        LaeError: if the study cannot be planned, nothing could be computed, or a worker died.
+    """
+    plan = make_plan(study, base)
+    store = Store(folder)
+    with store.locked():
+        return _run(plan, store, workers, scheduler, progress)
+
+
+def _run(
+    plan: Plan,
+    store: Store,
+    workers: int | None,
+    scheduler: str | None,
+    progress: Callable[[str, int, int], object],
+) -> StudyResults:
+    study = plan.study
+    store.prepare(plan.cells)
+    asked = [] if study.require_auc is None else searches(plan.cells, study.require_auc)
+    described = [Description(source.input, study.sequences) for source in plan.sources]
+    cells = [cell for cell in plan.cells if not store.has(cell)]
+    sought = [search for search in asked if store.found(search.key) is None]
+    needed = {*(cell.forecaster for cell in cells), *(each.cell.forecaster for each in sought)}
+    factories, training = _factories(plan, needed, store, lambda what: progress(what, 0, 1))
+    works: list[Work] = [
+        *(each for each in described if store.found(each.key) is None),
+        *tasks(cells, factories),
+        *(replace(search, factory=factories[search.cell.forecaster]) for search in sought),
+    ]
+    failures, computed = [], 0
+    count = min(workers or _cores(), max(len(works), 1))
+    with _executor(count, scheduler) as (executor, size):
+        for done, (work, result) in enumerate(run_all(attempt, works, executor, size)):
+            progress("", done + 1, len(works))
+            if isinstance(result, Failure):
+                failures.append({"of": told(work), "reason": result.reason})
+            elif not isinstance(work, Task):
+                store.keep(work.key, result)
+            else:
+                for cell, found in result:
+                    if isinstance(found, Failure):
+                        failures.append({"of": cell_told(cell), "reason": found.reason})
+                    else:
+                        store.put(found)
+                        computed += 1
+    progress("summing up", len(works), len(works))
+    scores = tuple(read_scores(plan, store))
+    if not scores:
+        raise LaeError(f"nothing could be computed: {failures[0]['reason']}")
+    summary = tuple(summarise_study(scores, study.seed))
+    results = StudyResults(
+        folder=store.folder,
+        plan=plan,
+        scores=scores,
+        summary=summary,
+        comparisons=tuple(compare_traces(scores, study.seed)),
+        required=tuple(
+            requirement(search, found) for search in asked if (found := store.found(search.key))
+        ),
+        traces=tuple(found for each in described if (found := store.found(each.key))),
+        computed=computed,
+        failures=tuple(sorted(failures, key=str)),
+        training=tuple(training),
+    )
+    _write(results)
+    return results
+
+
+def _factories(
+    plan: Plan, needed: set[str], store: Store, progress: Callable[[str], object]
+) -> tuple[dict[str, AnyFactory], list[str]]:
+    """A factory for each forecaster needed, and what to say of training, now or before."""
+    key = f"{plan.training}-training"
+    if needed.isdisjoint(plan.trainers):
+        kept = {name: each for name, each in plan.forecasters.items() if name in needed}
+        told = store.found(key) if plan.trainers else None
+        return cast(dict[str, AnyFactory], kept), (told or {}).get("notes", [])
+    factories, notes = plan.trained(progress)
+    store.keep(key, {"notes": notes})
+    return factories, notes
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _executor(
+    workers: int, scheduler: str | None
+) -> Iterator[tuple[Executor | None, Callable[[], int]]]:
+    if scheduler is not None:
+        with cluster_executor(scheduler) as found:
+            yield found
+    elif workers == 1:
+        yield None, lambda: 1
+    else:
+        with local_executor(workers) as executor:
+            yield executor, lambda: workers
+
+
+def _write(results: StudyResults) -> None:
+    """Write the summary, as CSV and JSON."""
+    tables = {
+        "summary": results.summary,
+        "comparisons": results.comparisons,
+        "required": results.required,
+    }
+    for name, rows in tables.items():
+        path = results.folder / f"{name}.csv"
+        if rows:
+            write_csv(rows, path)
+        else:
+            path.unlink(missing_ok=True)
+    with written_whole(results.folder / "study.json") as temporary:
+        temporary.write_text(json.dumps(results.document(), allow_nan=False))
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> None:
+    """Write rows as CSV, whole or not at all; what is unknown is empty."""
+    columns = list(dict.fromkeys(chain.from_iterable(rows)))
+    with written_whole(path) as temporary, open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,233 @@
+"""What a study asks for: traces, forecasters, worlds and repetitions, from TOML or Python."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, TypeVar
+
+from lae_sim.engine.clock import parse_fps, parse_rational
+from lae_sim.errors import LaeError
+from lae_sim.evaluation.metrics import find_convention
+from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.replay.world import parse_latency, parse_policy
+
+RANDOM = ("bootstrap", "resample", "lognormal")
+"""Latencies that are drawn anew in each repetition."""
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class Study:
+    """Traces, and all the ways in which they are replayed and scored: every list is crossed.
+
+    Attributes:
+        traces: files, folders, globs and URLs.
+        timing: traces of other devices to take the times from too; each goes with the traces of
+            its tracker and dataset. The traces' own times always count.
+        forecasters: names, as on command lines; hold is always there.
+        policies: which frame a free tracker takes.
+        fps: world frame rates; None is each trace's own.
+        latencies: where times come from: ``"recorded"``, ``"by-call"``, ``"constant:47ms"``, or one
+            of ``RANDOM``, which is repeated.
+        scales: exact factors on all times.
+        sigmas: permitted latencies in frames, ascending.
+        conventions: how frames and thresholds count.
+        costs: what forecasting costs, such as ``"2ms"`` or ``"kalman=2ms"``.
+        sequences: those wanted; all if empty.
+        attributes: whether the report has scores per attribute.
+        repetitions: how often random latencies are drawn.
+        seed: of random latencies, resamples and training.
+        block: consecutive calls that the bootstrap of latencies keeps together.
+        folds: of the training, where a forecaster is trained.
+        require_auc: AUC for which the needed speed is looked for; None = not looked for.
+    """
+
+    traces: tuple[str, ...]
+    timing: tuple[str, ...] = ()
+    forecasters: tuple[str, ...] = ("hold", "kalman")
+    policies: tuple[str, ...] = ("latest",)
+    fps: tuple[Fraction | None, ...] = (None,)
+    latencies: tuple[str, ...] = ("recorded",)
+    scales: tuple[Fraction, ...] = (Fraction(1),)
+    sigmas: tuple[Fraction, ...] = (Fraction(0),)
+    conventions: tuple[str, ...] = ("pysot",)
+    costs: tuple[str, ...] = ()
+    sequences: tuple[str, ...] = ()
+    attributes: bool = True
+    repetitions: int = 100
+    seed: int = 0
+    block: int = 30
+    folds: int = 5
+    require_auc: Fraction | None = None
+
+    def __post_init__(self) -> None:
+        if not self.traces:
+            raise LaeError("traces: a study needs at least one trace")
+        if self.repetitions > 1_000_000:
+            raise LaeError(f"repetitions: {self.repetitions} are too many: at most a million")
+        for latency in self.latencies:
+            _check_latency(latency)
+        for policy in self.policies:
+            if parse_policy(policy)[1]:
+                raise LaeError(f"policies: {policy} never scores latency: it goes with replay")
+        for cost in self.costs:
+            if cost.rpartition("=")[2] == "measured":
+                raise LaeError("costs: declare a time: one measured would differ on every worker")
+        for convention in self.conventions:
+            find_convention(convention)
+        if "offline" in self.forecasters:
+            raise LaeError("forecasters: offline is the tracker's own score, and always there")
+        if list(self.sigmas) != sorted(set(self.sigmas)) or not self.sigmas:
+            raise LaeError("sigma: permitted latencies must be ascending, each of them once")
+        if any(scale < 0 for scale in self.scales):
+            raise LaeError("scales: times cannot be scaled by less than 0")
+        if self.require_auc is not None and not 0 < self.require_auc < 1:
+            raise LaeError(f"require_auc: an AUC is between 0 and 1, not {self.require_auc}")
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Study:
+        """A study from plain values, as TOML or JSON has them; numbers may be given as text.
+
+        Raises:
+            LaeError: if a key is unknown, or a value impossible; it names the key.
+        """
+        values = {}
+        for key, value in document.items():
+            if key not in _KEYS:
+                raise LaeError(f"unknown key {key!r}{_meant(key)}")
+            name, parse = _KEYS[key]
+            try:
+                values[name] = parse(value)
+            except LaeError as error:
+                raise LaeError(f"{key}: {error}") from error
+        if "traces" not in values:
+            raise LaeError("the key 'traces' is missing: name files, folders, globs or URLs")
+        return cls(**values)
+
+    def document(self) -> dict[str, Any]:
+        """Plain values of everything, for provenance and digests."""
+        return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+
+
+def read_study(path: str) -> Study:
+    """Read a study from a TOML file; local traces are relative to its folder.
+
+    Raises:
+        LaeError: if it cannot be read, is not TOML, or is no valid study.
+    """
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+
+    try:
+        text = Path(path).read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise LaeError(f"{path}: cannot be read: {error}") from error
+    try:
+        # numbers stay as they are written: no float comes between
+        document = tomllib.loads(text, parse_float=str)
+        return Study.of(document)
+    except (tomllib.TOMLDecodeError, LaeError) as error:
+        raise LaeError(f"{path}: {error}") from error
+
+
+def _check_latency(latency: str) -> None:
+    name, _, value = latency.partition(":")
+    if name in RANDOM:
+        if value:
+            raise LaeError(f"latencies: {latency!r}: in a study the keys seed and block say so")
+        return
+    try:
+        parse_latency(latency)
+    except LaeError as error:
+        raise LaeError(f"latencies: {error} (in a study: {', '.join(RANDOM)} as they are)") from (
+            error
+        )
+
+
+def _meant(key: str) -> str:
+    """A hint at what was meant."""
+    close = difflib.get_close_matches(key, _KEYS, 1)
+    return f": did you mean {close[0]!r}?" if close else f": there are {', '.join(_KEYS)}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
+    return str(value) if isinstance(value, Fraction) else value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value:
+        raise LaeError(f"{value!r} is not text")
+    return value
+
+
+def _exact(value: Any) -> Fraction:
+    if isinstance(value, bool) or not isinstance(value, (int, str, Fraction)):
+        raise LaeError(f"{value!r} is not an exact number, such as 2, 0.5 or '1/3'")
+    return value if isinstance(value, Fraction) else parse_rational(str(value))
+
+
+def _rate(value: Any) -> Fraction | None:
+    return None if value == "trace" else parse_fps(str(_exact(value)))
+
+
+def _sigmas(value: Any) -> tuple[Fraction, ...]:
+    return SIGMA_GRID if value == "grid" else tuple(sorted(_several(_exact)(value)))
+
+
+def _several(parse: Callable[[Any], Value]) -> Callable[[Any], tuple[Value, ...]]:
+    """A list of values, or one value; each once."""
+
+    def parsed(value: Any) -> tuple[Value, ...]:
+        values = value if isinstance(value, (list, tuple)) else [value]
+        if not values:
+            raise LaeError("the list is empty: leave the key out, or name something")
+        return tuple(dict.fromkeys(map(parse, values)))
+
+    return parsed
+
+
+def _whole(least: int) -> Callable[[Any], int]:
+    def parsed(value: Any) -> int:
+        if type(value) is not int or not least <= value < 2**63:
+            raise LaeError(f"{value!r} is not a whole number from {least}")
+        return value
+
+    return parsed
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise LaeError(f"{value!r} is neither true nor false")
+    return value
+
+
+# key of the file -> (attribute, how its value is read)
+_KEYS: Mapping[str, tuple[str, Callable[[Any], Any]]] = {
+    "traces": ("traces", _several(_text)),
+    "timing": ("timing", _several(_text)),
+    "forecasters": ("forecasters", _several(_text)),
+    "policies": ("policies", _several(_text)),
+    "fps": ("fps", _several(_rate)),
+    "latencies": ("latencies", _several(_text)),
+    "scales": ("scales", _several(_exact)),
+    "sigma": ("sigmas", _sigmas),
+    "conventions": ("conventions", _several(_text)),
+    "costs": ("costs", _several(_text)),
+    "sequences": ("sequences", _several(_text)),
+    "attributes": ("attributes", _flag),
+    "repetitions": ("repetitions", _whole(1)),
+    "seed": ("seed", _whole(0)),
+    "block": ("block", _whole(1)),
+    "folds": ("folds", _whole(2)),
+    "require_auc": ("require_auc", _exact),
+}

@@ -1,0 +1,117 @@
+"""Where the cells of a study lie."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from lae_sim.errors import LaeError
+from lae_sim.files import written_whole
+from lae_sim.study.cells import Cell, Result
+
+_CELLS = "[0-9a-f]" * 32 + ".parquet"
+
+
+class Store:
+    """The folder of a study's finished cells.
+
+    ``results`` holds exactly the cells of the plan, as one Parquet dataset; ``about`` says more of
+    each; ``unused`` keeps finished cells of other plans, in case they are wanted again.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        self.results, self._about, self._unused = (
+            self.folder / name for name in ("results", "about", "unused")
+        )
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other studies out of the folder, where the system can.
+
+        Raises:
+            LaeError: if one is at work there.
+        """
+        try:
+            import fcntl
+        except ImportError:  # Windows
+            yield
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self.folder, os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield
+        except BlockingIOError as error:
+            raise LaeError(f"{self.folder}: another study is writing there") from error
+        finally:
+            os.close(descriptor)
+
+    def prepare(self, cells: Iterable[Cell]) -> None:
+        """Make the folder, bring the cells of the plan back, and set those of others aside.
+
+        Raises:
+            LaeError: if it cannot be written, or is a folder of something else.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            folders = (self.results, self._about, self._unused)
+            if any(self.folder.iterdir()) and not all(path.is_dir() for path in folders):
+                raise LaeError(f"{self.folder}: is not empty and not of a study: name another")
+            for path in folders:
+                path.mkdir(exist_ok=True)
+            wanted = {f"{cell.key}.parquet" for cell in cells}
+            for path in self.results.glob(_CELLS):
+                if path.name not in wanted:
+                    path.replace(self._unused / path.name)
+            for path in self._unused.glob(_CELLS):
+                if path.name in wanted:
+                    path.replace(self.results / path.name)
+        except OSError as error:
+            raise LaeError(f"{self.folder}: {error.strerror or error}") from error
+
+    def has(self, cell: Cell) -> bool:
+        """Whether a cell is finished."""
+        return self.rows(cell).is_file() and self._details(cell.key).is_file()
+
+    def put(self, result: Result) -> None:
+        """Keep a result; its rows come last, and say that it is finished."""
+        self.keep(result.key, result.about)
+        with written_whole(self.results / f"{result.key}.parquet") as temporary:
+            temporary.write_bytes(result.rows)
+
+    def found(self, key: str) -> dict[str, Any] | None:
+        """A document that was kept under a key, if it was."""
+        path = self._details(key)
+        return self._read(path) if path.is_file() else None
+
+    def keep(self, key: str, document: Any) -> None:
+        """Keep a document under a key."""
+        with written_whole(self._details(key)) as temporary:
+            temporary.write_text(json.dumps(document, allow_nan=False))
+
+    def rows(self, cell: Cell) -> Path:
+        """The file of a cell's rows."""
+        return self.results / f"{cell.key}.parquet"
+
+    def about(self, cell: Cell) -> dict[str, Any]:
+        """What is known of a finished cell beside its rows (see :class:`Result`).
+
+        Raises:
+            LaeError: if its file is damaged.
+        """
+        return self._read(self._details(cell.key))
+
+    def _read(self, path: Path) -> dict[str, Any]:
+        try:
+            found: dict[str, Any] = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise LaeError(f"{path}: cannot be read: {error}; delete it") from error
+        return found
+
+    def _details(self, key: str) -> Path:
+        return self._about / f"{key}.json"

@@ -1,0 +1,122 @@
+"""The pieces of work that a study hands to its workers."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from lae_sim import __version__
+from lae_sim.errors import LaeError, explained
+from lae_sim.study.cells import Cell, Input, Result, Setting, Task, compute
+from lae_sim.study.deployment import Search, slowest
+from lae_sim.trace.locate import digest, stamp
+
+
+@dataclass(frozen=True)
+class Description:
+    """A trace that is to be described, as ``lae-sim show`` does.
+
+    Attributes:
+        trace: which.
+        sequences: those wanted; all if empty.
+    """
+
+    trace: Input
+    sequences: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """Digest of all that the description depends on."""
+        told = repr((__version__, self.trace.label, self.trace.digest, self.sequences))
+        return hashlib.sha256(told.encode()).hexdigest()[:32]
+
+
+Work: TypeAlias = Description | Task | Search
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why something could not be computed, in a line or two."""
+
+    reason: str
+
+
+def attempt(work: Work) -> Any:
+    """Do a piece of work, on some worker; what cannot be done is a :class:`Failure`.
+
+    Returns:
+        Of a description or a search its document, of a task a pair of each cell and its result.
+    """
+    try:
+        with explained("failed"):
+            for trace in _inputs(work):
+                if stamp(trace.path) != trace.stamp and digest(trace.path) != trace.digest:
+                    raise LaeError(f"{trace.path}: changed since the study began: run it again")
+            return _performed(work)
+    except LaeError as error:
+        return Failure(str(error))
+
+
+def _performed(work: Work) -> Any:
+    if isinstance(work, Task):
+        return _cell_by_cell(work)
+    if isinstance(work, Search):
+        return slowest(work)
+    from lae_sim.trace.describe import describe
+    from lae_sim.trace.file import read_trace
+
+    trace = read_trace(work.trace.path, work.sequences or None)
+    return describe(trace, work.trace.label)[0]
+
+
+def _cell_by_cell(task: Task) -> list[tuple[Cell, Result | Failure]]:
+    """The cells together; where that fails, each alone, so that one does not cost the others."""
+    try:
+        with explained("failed"):
+            results = {result.key: result for result in compute(task)}
+            return [(cell, results[cell.key]) for cell in task.cells]
+    except LaeError as error:
+        if len(task.cells) == 1:
+            return [(task.cells[0], Failure(str(error)))]
+    alone = [
+        Task((cell,), {cell.forecaster: task.factories[cell.forecaster]}) for cell in task.cells
+    ]
+    found = [each for one in alone for each in _cell_by_cell(one)]
+    reasons = {result.reason if isinstance(result, Failure) else "" for _, result in found}
+    if len(reasons) == 1 and reasons != {""}:
+        raise LaeError(*reasons)  # it lies with the replay
+    return found
+
+
+def _inputs(work: Work) -> list[Input]:
+    if isinstance(work, Description):
+        return [work.trace]
+    setting = _setting(work)
+    return [each for each in (setting.trace, setting.timing) if each is not None]
+
+
+def _setting(work: Task | Search) -> Setting:
+    return work.cells[0].setting if isinstance(work, Task) else work.cell.setting
+
+
+def told(work: Work) -> str:
+    """What a piece of work is about, in words."""
+    if isinstance(work, Description):
+        return work.trace.label
+    if isinstance(work, Search):
+        cell = work.cell
+        return (
+            f"AUC {float(work.required):g} of {cell.forecaster}: {_in_words(cell.setting, False)}"
+        )
+    return _in_words(_setting(work))
+
+
+def _in_words(setting: Setting, scale: bool = True) -> str:
+    factor = f" x {setting.scale}" if scale and setting.scale != 1 else ""
+    return f"{setting.run}, {setting.policy}, {setting.fps} fps, {setting.latency}{factor}"
+
+
+def cell_told(cell: Cell) -> str:
+    """What a cell is about, in words."""
+    return f"{_in_words(cell.setting)}, {cell.forecaster}, {cell.convention}"

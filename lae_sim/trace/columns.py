@@ -1,0 +1,179 @@
+"""The rows of a trace as flat columns: between Parquet and recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim.trace.recording import Recording
+
+TRUTH = ("truth_x", "truth_y", "truth_w", "truth_h")
+BOX = ("x", "y", "w", "h")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Consecutive rows of a trace, n of them, of which each run of equal names is a sequence.
+
+    Attributes:
+        names: the name of each run.
+        starts: first row of each run, and n: int64 [runs + 1].
+        frame: int64 [n].
+        truth, boxes: float64 [n, 4], NaN where null.
+        truth_null, box_null: bool [n, 4].
+        elapsed_ns: int64 [n], -1 where null.
+        elapsed_null: bool [n].
+        score: float32 [n], NaN where null.
+    """
+
+    names: list[str]
+    starts: Ints
+    frame: Ints
+    truth: Floats
+    truth_null: Bools
+    boxes: Floats
+    box_null: Bools
+    elapsed_ns: Ints
+    elapsed_null: Bools
+    score: npt.NDArray[np.float32]
+
+    @classmethod
+    def of_recordings(cls, recordings: Sequence[Recording]) -> Rows:
+        """The rows of whole recordings."""
+        lengths = [len(recording) for recording in recordings]
+        truth = np.concatenate([recording.truth for recording in recordings])
+        boxes = np.concatenate([recording.boxes for recording in recordings])
+        elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
+        return cls(
+            names=[recording.name for recording in recordings],
+            starts=np.cumsum([0, *lengths]),
+            frame=np.concatenate([np.arange(length) for length in lengths]),
+            truth=truth,
+            truth_null=np.isnan(truth),
+            boxes=boxes,
+            box_null=np.isnan(boxes),
+            elapsed_ns=elapsed,
+            elapsed_null=elapsed == -1,
+            score=np.concatenate([recording.score for recording in recordings]),
+        )
+
+    @classmethod
+    def of_batch(cls, batch: Any) -> Rows:
+        """The rows of an Arrow record batch whose names are dictionary-encoded."""
+        column = dict(zip(batch.schema.names, batch.columns))
+        indices = column["sequence"].indices
+        dictionary = [*column["sequence"].dictionary.to_pylist(), ""]
+        column["sequence"].validate(full=True)
+        codes = np.where(is_null(indices), len(dictionary) - 1, to_numpy(indices, np.int32))
+        edges = np.flatnonzero(np.diff(codes)) + 1
+        starts = np.concatenate([[0], edges, [len(codes)]])
+        truth, truth_null = _boxes(column, TRUTH, len(codes))
+        boxes, box_null = _boxes(column, BOX, len(codes))
+        elapsed_null = is_null(column["elapsed_ns"])
+        score = np.full(len(codes), np.nan, np.float32)
+        if "score" in column:
+            scored = ~is_null(column["score"])
+            score[scored] = to_numpy(column["score"], np.float32)[scored]
+        return cls(
+            names=[dictionary[code] for code in codes[starts[:-1]]],
+            starts=starts,
+            frame=to_numpy(column["frame"], np.int32).astype(np.int64),
+            truth=truth,
+            truth_null=truth_null,
+            boxes=boxes,
+            box_null=box_null,
+            elapsed_ns=np.where(elapsed_null, -1, to_numpy(column["elapsed_ns"], np.int64)),
+            elapsed_null=elapsed_null,
+            score=score,
+        )
+
+    def to_batch(self, schema: Any) -> Any:
+        """The rows as an Arrow record batch of the schema."""
+        import pyarrow as pa
+
+        codes = np.repeat(np.arange(len(self.names), dtype=np.int32), np.diff(self.starts))
+        names = pa.DictionaryArray.from_arrays(from_numpy(codes), from_texts(self.names))
+        columns = [
+            names.cast(pa.string()),
+            from_numpy(self.frame.astype(np.int32)),
+            *(from_numpy(self.truth[:, i], ~self.truth_null[:, i]) for i in range(4)),
+            *(from_numpy(self.boxes[:, i], ~self.box_null[:, i]) for i in range(4)),
+            from_numpy(self.elapsed_ns, ~self.elapsed_null),
+            from_numpy(self.score, ~np.isnan(self.score)),
+        ]
+        return pa.RecordBatch.from_arrays(columns, schema=schema)
+
+    def recordings(self) -> Iterator[Recording]:
+        """Each run of rows as a recording."""
+        for name, start, end in zip(self.names, self.starts[:-1], self.starts[1:]):
+            run = slice(start, end)
+            yield Recording(
+                name, self.truth[run], self.boxes[run], self.elapsed_ns[run], self.score[run]
+            )
+
+
+def _boxes(column: dict[str, Any], names: tuple[str, ...], n: int) -> tuple[Floats, Bools]:
+    """Four columns as boxes and where they are null; columns that are absent are all null."""
+    boxes = np.full((n, 4), np.nan)
+    null = np.ones((n, 4), np.bool_)
+    for i, name in enumerate(names):
+        if name in column:
+            values = to_numpy(column[name], np.float64)
+            null[:, i] = is_null(column[name])
+            boxes[:, i] = np.where(null[:, i], np.nan, values) if null[:, i].any() else values
+    return boxes, null
+
+
+def checksums(option: str) -> dict[str, bool]:
+    """The option that writes or checks page checksums, where pyarrow has it (15 and newer)."""
+    import pyarrow as pa
+
+    return {option: True} if int(pa.__version__.split(".")[0]) >= 15 else {}
+
+
+def from_numpy(values: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = None) -> Any:
+    """An Arrow array of one-dimensional numbers; null where ``valid`` is false."""
+    import pyarrow as pa
+
+    values = np.ascontiguousarray(values)
+    bitmap = None
+    if valid is not None and not valid.all():
+        bitmap = pa.py_buffer(np.packbits(valid, bitorder="little").tobytes())
+    arrow_type = pa.from_numpy_dtype(values.dtype)
+    return pa.Array.from_buffers(arrow_type, len(values), [bitmap, pa.py_buffer(values)])
+
+
+def from_texts(texts: Sequence[str], times: int = 1) -> Any:
+    """An Arrow array of texts, each so many times in a row."""
+    import pyarrow as pa
+
+    encoded = [text.encode() for text in texts]
+    sizes = np.repeat(np.array([len(text) for text in encoded], np.int32), times)
+    ends = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+    joined = b"".join(text * times for text in encoded)
+    buffers = [None, pa.py_buffer(ends), pa.py_buffer(joined)]
+    return pa.Array.from_buffers(pa.string(), len(sizes), buffers)
+
+
+def to_numpy(array: Any, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """The values of a primitive Arrow array; what stands where it is null is arbitrary."""
+    data = array.buffers()[1]
+    if data is None:
+        return np.zeros(len(array), dtype)
+    return np.frombuffer(data, dtype, len(array), array.offset * np.dtype(dtype).itemsize)
+
+
+def is_null(array: Any) -> npt.NDArray[np.bool_]:
+    """Where an Arrow array is null, bool [n]."""
+    bitmap = array.buffers()[0]
+    if bitmap is None or not array.null_count:
+        return np.zeros(len(array), np.bool_)
+    end = array.offset + len(array)
+    bits = np.unpackbits(np.frombuffer(bitmap, np.uint8), count=end, bitorder="little")
+    null: npt.NDArray[np.bool_] = bits[array.offset :] == 0
+    return null

@@ -1,0 +1,287 @@
+"""Statistics of the processing times in a trace: distribution, drift over the run, stalls."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim._arrays import Floats, Ints
+from lae_sim.trace.recording import Recording
+
+if TYPE_CHECKING:
+    from lae_sim.trace.file import Trace
+    from lae_sim.trace.metadata import Metadata
+
+STALL = 10
+"""A call is a stall if it takes more than so many times the median."""
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceTimes:
+    """What the calls of one sequence took.
+
+    Attributes:
+        name: the sequence's name.
+        init_ns: time of the initialisation on frame 0, ns.
+        frames: the other frames that were processed, int32 [n].
+        elapsed_ns: their times in ns, int64 [n].
+    """
+
+    name: str
+    init_ns: int
+    frames: npt.NDArray[np.int32]
+    elapsed_ns: Ints
+
+    @classmethod
+    def of(cls, recording: Recording) -> SequenceTimes:
+        """The times of a recording."""
+        frames = np.flatnonzero(recording.elapsed_ns >= 0)[1:].astype(np.int32)
+        init = int(recording.elapsed_ns[0])
+        return cls(recording.name, init, frames, recording.elapsed_ns[frames])
+
+
+def summary(elapsed_ns: Ints) -> dict[str, float]:
+    """Number, quantiles and mean of times, ms, and ``fps``, calls per second of computing."""
+    if not len(elapsed_ns):
+        return {"n": 0}
+    p50, p90, p95, p99, top = (np.quantile(elapsed_ns, [0.5, 0.9, 0.95, 0.99, 1]) / 1e6).tolist()
+    mean = float(elapsed_ns.mean()) / 1e6
+    found = {"n": len(elapsed_ns), "mean_ms": mean, "median_ms": p50, "p90_ms": p90}
+    found |= {"p95_ms": p95, "p99_ms": p99, "max_ms": top}
+    return found | ({"fps": 1e3 / mean} if mean else {})
+
+
+def share_slower(elapsed_ns: Ints, fps: Fraction) -> float:
+    """Share of the calls that take longer than the interval between frames, exactly."""
+    return float(np.mean(elapsed_ns > 10**9 // fps)) if len(elapsed_ns) else 0.0
+
+
+def histogram(elapsed_ns: Ints) -> dict[str, Any]:
+    """Counts of times between round ``edges_ms``, and of outliers ``below`` and ``above`` them.
+
+    The edges hold 96 % of the times; where these are more than a factor of 8 apart, the bins grow
+    with the time.
+
+    Args:
+        elapsed_ns: times in ns, int64 [n], n > 0.
+    """
+    ms = elapsed_ns / 1e6
+    low, high = np.quantile(ms, [0.02, 0.98]).tolist()
+    if high > 8 * low > 0:
+        around = np.geomspace(0.95 * low, 1.05 * high, 14)
+        edges = np.array([float(f"{edge:.2g}") for edge in around])
+    else:
+        step = float(f"{max(high - low, high / 50, 1e-6) / 12:.1g}")
+        edges = np.round(step * np.arange(low // step, high // step + 2), 9)
+    return {
+        "edges_ms": edges.tolist(),
+        "counts": np.histogram(ms, edges)[0].tolist(),
+        "below": int((ms < edges[0]).sum()),
+        "above": int((ms > edges[-1]).sum()),
+    }
+
+
+def drift(sequences: Sequence[SequenceTimes]) -> dict[str, Any]:
+    """Whether the tracker became slower, from sequences in the order in which they were run.
+
+    Compared are the medians of sequences, or of 30 parts of the run if there are fewer than 15
+    sequences: the first third with the last, by the rank test of Mann and Whitney (1947).
+
+    Returns:
+        ``tenths_ms``, medians of the tenths of the run; ``ratio``, the last third to the first;
+        ``slower``, where it exceeds 1.1 and not by chance (1 %, one-sided). Empty if there are
+        fewer than 100 calls.
+    """
+    times = [sequence.elapsed_ns for sequence in sequences if len(sequence.elapsed_ns)]
+    run = np.concatenate(times) if times else np.zeros(0)
+    if len(run) < 100:
+        return {}
+    medians = _medians(times if len(times) >= 15 else np.array_split(run, 30))
+    third = len(medians) // 3
+    first, last = np.sort(medians[:third]), medians[-third:]
+    # how often a value of the last third exceeds one of the first, ties counting half
+    wins = sum(np.searchsorted(first, last, side).sum() / 2 for side in ("left", "right"))
+    z = (wins - third**2 / 2) / math.sqrt(third**2 * (2 * third + 1) / 12)
+    ratio = float(np.median(last) / max(np.median(first), 1e-6))
+    return {
+        "tenths_ms": _medians(np.array_split(run, 10)).tolist(),
+        "ratio": ratio,
+        "slower": bool(ratio > 1.1 and z > 2.33),
+    }
+
+
+def first_calls(sequences: Sequence[SequenceTimes]) -> dict[str, float]:
+    """The first call after each initialisation: median, ms, and ratio to the sequence's others."""
+    times = [sequence.elapsed_ns for sequence in sequences if len(sequence.elapsed_ns) > 1]
+    if not times:
+        return {}
+    ratios = [part[0] / max(np.median(part[1:]), 1) for part in times]
+    return {
+        "median_ms": float(np.median([part[0] for part in times])) / 1e6,
+        "ratio": float(np.median(ratios)),
+    }
+
+
+def stalls(sequences: Sequence[SequenceTimes]) -> list[dict[str, Any]]:
+    """Calls that took over ten times the median of the run and of their sequence, longest first."""
+    times = [sequence.elapsed_ns for sequence in sequences]
+    middle = np.median(np.concatenate(times)) if sum(map(len, times)) else 0
+    found = []
+    for sequence in sequences:
+        ns = sequence.elapsed_ns
+        for call in np.flatnonzero(ns > STALL * max(middle, np.median(ns) if len(ns) else 0)):
+            stall = {"sequence": sequence.name, "frame": int(sequence.frames[call])}
+            found.append({**stall, "ms": int(ns[call]) / 1e6, "first_call": bool(call == 0)})
+    return sorted(found, key=lambda stall: -stall["ms"])
+
+
+def _medians(parts: Sequence[Any]) -> Floats:
+    """Medians of arrays of ns, ms."""
+    return np.array([np.median(part) for part in parts]) / 1e6
+
+
+Facts = dict[str, Any]
+
+
+def throttling(
+    before: Mapping[str, Any], during: Sequence[Mapping[str, Any]], after: Mapping[str, Any]
+) -> str | None:
+    """What readings say of throttling during a profile, in one sentence; None if nothing.
+
+    Clocks are compared between the first and the last third of the readings, the highest of each,
+    since a clock that was read in a pause is low for another reason. 10 % is a fall.
+
+    Args:
+        before: what ``readings`` returned before the profile.
+        during: what it returned in the course of it.
+        after: what it returned at the end.
+    """
+    signs = []
+    everything = [before, *during, after]
+    counters = [r["throttle_events"] for r in everything if "throttle_events" in r]
+    for name in counters[0] if counters else ():
+        if (rise := counters[-1].get(name, 0) - counters[0][name]) > 0:
+            signs.append(f"{name} rose by {rise}")
+    for reason, count in Counter(s for r in during for s in r.get("gpu_slowdowns", ())).items():
+        signs.append(f"the GPU reported {reason} in {count} of {len(during)} readings")
+    for unit in ("CPU", "GPU"):
+        for key, readings in (("allowed", everything), ("highest", during)):
+            mhz = [r.get(f"{unit.lower()}_mhz", {}).get(key) for r in readings]
+            known = [value for value in mhz if value] or [0]
+            third = -(-len(known) // 3)
+            first, last = max(known[:third]), max(known[-third:])
+            if last < 0.9 * first:
+                signs.append(f"the {unit}'s {key} clock fell from {first:,.0f} to {last:,.0f} MHz")
+    return "throttling: " + "; ".join(signs) if signs else None
+
+
+def gathered(**parts: Callable[[], Any]) -> Facts:
+    """What the functions return, without what is empty or fails."""
+    found = {}
+    for name, part in parts.items():
+        try:
+            value = part()
+            json.dumps(value, allow_nan=False)  # an infinity is such an oddity too
+        except Exception:  # no oddity of a system file may end a profile of an hour
+            continue
+        if value not in (None, "", {}, []):
+            found[name] = value
+    return found
+
+
+Report = dict[str, Any]
+
+
+_NOT_SHOWN = ("format", "version", "fps", "sequences", "failures")
+
+
+def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
+    """What ``--json`` prints of a trace, and its times in the order in which they were taken.
+
+    Args:
+        trace: the trace; it is read once.
+        path: the file that it is from.
+
+    Raises:
+        TraceError: if it is not a valid trace.
+    """
+    import numpy as np
+
+    from lae_sim.trace import describe as timing
+
+    metadata = trace.metadata
+    entries = metadata.document.get("sequences", {})
+    sequences, frames, with_truth, sizes = [], 0, 0, Counter[str]()
+    for recording in trace:
+        sequences.append(timing.SequenceTimes.of(recording))
+        frames += len(recording)
+        with_truth += int((~np.isnan(recording.truth[:, 0])).sum())
+        size = metadata.image_size(recording.name)
+        sizes[f"{size[0]}x{size[1]}" if size else "unknown"] += 1
+    order = {s.name: entries.get(s.name, {}).get("order") for s in sequences}
+    ordered = all(isinstance(place, int) for place in order.values())
+    if ordered:
+        sequences.sort(key=lambda s: order[s.name])
+    calls = np.concatenate([s.elapsed_ns for s in sequences])
+    failures = metadata.document.get("failures")
+    lost = [entries.get(s.name, {}).get("lost") for s in sequences]
+    report = {
+        "trace": path,
+        "fps": str(metadata.fps),
+        "provenance": {k: v for k, v in metadata.document.items() if k not in _NOT_SHOWN},
+        "sequences": len(sequences),
+        "world_frames": frames,
+        "processed": len(calls) + len(sequences),
+        "with_truth": with_truth,
+        "image_sizes": dict(sizes.most_common()),
+        "lost": sum(lost) if all(isinstance(n, int) for n in lost) else None,
+        "failures": failures if isinstance(failures, list) else [],
+        "times": {
+            "calls": timing.summary(calls),
+            "initialisations": timing.summary(np.array([s.init_ns for s in sequences])),
+            "frame_interval_ms": float(1000 / metadata.fps),
+            "slower_than_frames": timing.share_slower(calls, metadata.fps),
+            "histogram": timing.histogram(calls) if len(calls) else None,
+            "first_calls": timing.first_calls(sequences),
+            "order_known": ordered,
+            "drift": timing.drift(sequences),
+            "stalls": timing.stalls(sequences),
+        },
+    }
+    return {**report, "warnings": list(_warnings(report, metadata))}, sequences
+
+
+def _warnings(report: Report, metadata: Metadata) -> Iterator[str]:
+    """What a user should know before trusting the times."""
+    first, drift = report["times"]["first_calls"], report["times"]["drift"]
+    if first and first["ratio"] > 1.5:
+        took = f"{first['median_ms']:.3g} ms, {first['ratio']:.2g} x the median of the others"
+        yield f"the first call after an initialisation takes {took}: warm up"
+    if drift and drift["slower"]:
+        longer = f"took {100 * drift['ratio'] - 100:.0f}% longer than the first third"
+        yield f"the last third of the run {longer}: heat, throttling, or harder sequences"
+    device = metadata.document.get("device", {})
+    taken = device.get("readings", {})
+    found = gathered(  # whatever another program wrote there
+        busy=lambda: _busy(taken["before"]["load"][0], device["cpu"]),
+        throttled=lambda: throttling(
+            taken.get("before", {}), taken.get("during", []), taken.get("after", {})
+        ),
+    )
+    yield from found.values()
+
+
+def _busy(load: float, cpu: Mapping[str, Any]) -> str | None:
+    """Whether other programs were running when the profile began."""
+    cores = cpu.get("affinity") or cpu["cores"]
+    if load <= cores / 2:
+        return None
+    return f"the load before the profile was {load:.1f} on {cores} cores: other programs were busy"

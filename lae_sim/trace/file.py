@@ -1,0 +1,227 @@
+"""Traces: a tracker's boxes and processing times on every world frame, in Parquet.
+
+The format is specified in ``traces/FORMAT.md``. Reading streams, so that memory does not grow with
+the file, and a trace is written whole or not at all. Nothing in a trace is ever executed.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lae_sim.errors import LaeError, TraceError
+from lae_sim.files import written_whole
+from lae_sim.trace.checks import COLUMN_TYPES, RowChecker, check_schema
+from lae_sim.trace.columns import BOX, TRUTH, Rows, checksums
+from lae_sim.trace.locate import is_url, opened
+from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
+
+HELD_FRAMES = 1 << 18
+
+
+@dataclass(frozen=True, repr=False)
+class Trace:
+    """A trace: its metadata, and its recordings sorted by name.
+
+    Iterate over it to get the recordings; a trace that was read from a file is read again, batch by
+    batch, on every iteration.
+    """
+
+    metadata: Metadata
+    recordings: Iterable[Recording]
+    frames: int | None = None
+    """World frames of all its sequences together, where known."""
+
+    def __iter__(self) -> Iterator[Recording]:
+        return iter(self.recordings)
+
+    def __repr__(self) -> str:
+        return f"<Trace of {self.metadata.tracker!r} on {self.metadata.dataset!r}>"
+
+
+def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None = None) -> Trace:
+    """Open a trace; the recordings are read and checked while one iterates over them.
+
+    Args:
+        path: the Parquet file, or the URL of one (``s3://…``; see :mod:`lae_sim.trace.locate`).
+        sequences: names to keep; all by default.
+
+    Raises:
+        TraceError: here or during iteration, if the file is not a valid trace; it names the file,
+            column, sequence and frame, and the likely cause.
+    """
+    stored = _StoredRecordings(os.fspath(path), None if sequences is None else frozenset(sequences))
+    metadata, rows = stored.describe()
+    return Trace(metadata, replace(stored, profiled=metadata.profiled), rows)
+
+
+def held(trace: Trace, frames: int = HELD_FRAMES) -> Trace:
+    """The trace, kept in memory from the start if it has at most so many world frames.
+
+    Raises:
+        TraceError: if it is not a valid trace.
+    """
+    if trace.frames is None or trace.frames > frames:
+        return trace
+    return replace(trace, recordings=list(trace))
+
+
+def validate(path: str | os.PathLike[str]) -> None:
+    """Read a whole trace and check it.
+
+    Raises:
+        TraceError: at the first fault.
+    """
+    for _ in read_trace(path):
+        pass
+
+
+def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
+    """Write a trace, whole or not at all; recordings stream through.
+
+    Raises:
+        TraceError: if the recordings are not sorted by name or break the format.
+        LaeError: if the file cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    types = {**COLUMN_TYPES, "score": "float32"}
+    schema = pa.schema(
+        [pa.field(name, types[name], nullable=name not in ("sequence", "frame")) for name in types],
+        {"lae_sim": trace.metadata.dumps()},
+    )
+    check = RowChecker(str(path), profiled=trace.metadata.profiled)
+    with (
+        written_whole(path) as temporary,
+        pq.ParquetWriter(
+            temporary,
+            schema,
+            compression="zstd",
+            compression_level=1,
+            use_dictionary=["sequence"],
+            column_encoding={
+                **dict.fromkeys((*TRUTH, *BOX, "score"), "BYTE_STREAM_SPLIT"),
+                "frame": "DELTA_BINARY_PACKED",
+                "elapsed_ns": "DELTA_BINARY_PACKED",
+            },
+            **checksums("write_page_checksum"),
+        ) as writer,
+    ):
+        group: list[Recording] = []
+        for group in batched(trace):
+            for recording in group:
+                if not len(recording):
+                    raise TraceError(f"{path}: sequence {recording.name!r} has no frames")
+            rows = Rows.of_recordings(group)
+            check(rows)
+            writer.write_batch(rows.to_batch(schema))
+        if not group:
+            raise TraceError(f"{path}: the trace is empty")
+
+
+@dataclass(frozen=True)
+class _StoredRecordings:
+    """The recordings of a file, read anew on each iteration."""
+
+    path: str
+    keep: frozenset[str] | None
+    profiled: bool = False
+
+    def describe(self) -> tuple[Metadata, int]:
+        """The file's metadata and its number of rows."""
+        with self._opened() as file:
+            check_schema(file.schema_arrow, self.path)
+            stored = (file.schema_arrow.metadata or {}).get(b"lae_sim")
+            if stored is None:
+                raise TraceError(
+                    f"{self.path}: metadata key 'lae_sim' is missing: is this a lae_sim trace? "
+                    "See 'lae-sim convert --help' to make one"
+                )
+            try:
+                return Metadata.parse(stored), file.metadata.num_rows
+            except TraceError as error:
+                raise TraceError(f"{self.path}: {error}") from error
+
+    def __iter__(self) -> Iterator[Recording]:
+        missing = set(self.keep or ())
+        for recording in self._all():
+            if self.keep is None or recording.name in self.keep:
+                missing.discard(recording.name)
+                yield recording
+        if missing:
+            raise LaeError(f"{self.path}: no sequence {', '.join(map(repr, sorted(missing)))}")
+
+    def _all(self) -> Iterator[Recording]:
+        """Recordings, put together again where a batch ends inside one."""
+        check = RowChecker(self.path, profiled=self.profiled)
+        parts: list[Recording] = []
+        for rows in self._rows():
+            check(rows)
+            for recording in rows.recordings():
+                if parts and recording.name != parts[0].name:
+                    yield _joined(parts)
+                    parts = []
+                parts.append(recording)
+        if not parts:
+            raise TraceError(f"{self.path}: the trace is empty")
+        yield _joined(parts)
+
+    def _rows(self) -> Iterator[Rows]:
+        with self._opened() as file:
+            present = [name for name in COLUMN_TYPES if name in file.schema_arrow.names]
+            groups = (file.metadata.row_group(g) for g in range(file.num_row_groups))
+            if sum(group.num_rows for group in groups) != file.metadata.num_rows:
+                raise TraceError(f"{self.path}: the file is damaged: its row counts disagree")
+            # twice, since row groups end with the sequence that fills them
+            batches = file.iter_batches(2 * BATCH_ROWS, columns=present, use_threads=False)
+            for batch in batches:
+                if batch.num_rows:
+                    yield Rows.of_batch(batch)
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        try:
+            with (
+                opened(self.path) as source,
+                pq.ParquetFile(
+                    source,
+                    read_dictionary=["sequence"],
+                    pre_buffer=False,
+                    **checksums("page_checksum_verification"),
+                ) as file,
+            ):
+                yield file
+        except FileNotFoundError as error:
+            raise TraceError(f"{self.path}: no such file") from error
+        except KeyError as error:  # from read_dictionary
+            raise TraceError(
+                f"{self.path}: column 'sequence' is missing: is this a lae_sim trace?"
+            ) from error
+        except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+            raise TraceError(f"{self.path}: not a readable Parquet file: {error}") from error
+        except Exception as error:
+            if isinstance(error, LaeError) or not is_url(self.path):
+                raise
+            raise TraceError(f"{self.path}: {type(error).__name__}: {error}") from error
+
+
+def _joined(parts: list[Recording]) -> Recording:
+    if len(parts) == 1:
+        return parts[0]
+    return Recording(
+        parts[0].name,
+        np.concatenate([part.truth for part in parts]),
+        np.concatenate([part.boxes for part in parts]),
+        np.concatenate([part.elapsed_ns for part in parts]),
+        np.concatenate([part.score for part in parts]),
+    )

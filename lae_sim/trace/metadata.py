@@ -1,0 +1,200 @@
+"""The metadata of a trace: a JSON document under the Parquet key ``lae_sim``.
+
+The document is kept as it was read; unknown keys travel along and are ignored.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from lae_sim.engine.clock import parse_fps, parse_rational
+from lae_sim.errors import LaeError, TraceError
+
+FORMAT = "lae-trace"
+VERSION = "1.0"
+KINDS = ("every-frame", "real-time")
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a trace says of itself.
+
+    Attributes:
+        fps: world frame rate, frames per second, exact.
+        kind: ``"every-frame"`` or ``"real-time"``.
+        document: the whole JSON object (see ``traces/FORMAT.md``).
+    """
+
+    fps: Fraction
+    kind: str
+    document: Mapping[str, Any]
+
+    @classmethod
+    def new(cls, fps: str, kind: str, **more: Any) -> Metadata:
+        """Metadata with the required keys, and any of the optional ones by name.
+
+        Args:
+            fps: the frame rate as exact text, such as ``"30000/1001"``.
+            kind: ``"every-frame"`` or ``"real-time"``.
+            more: optional keys: ``tracker``, ``device``, ``timing``, ``dataset``, ``sequences``;
+                ``schedule`` adds to the schedule object.
+
+        Raises:
+            TraceError: if a value does not fit the format.
+        """
+        schedule = {"kind": kind, **more.pop("schedule", {})}
+        document = {"format": FORMAT, "version": VERSION, "fps": fps, "schedule": schedule, **more}
+        return cls.of(document)
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Metadata:
+        """Metadata from a whole document.
+
+        Raises:
+            TraceError: if a value does not fit the format.
+        """
+        return cls.parse(json.dumps(document).encode())
+
+    @classmethod
+    def parse(cls, text: bytes) -> Metadata:
+        """Read and check the JSON document.
+
+        Raises:
+            TraceError: if it is not JSON, not of this format, or of a newer major version.
+        """
+        try:
+            document = json.loads(
+                text.decode(), parse_constant=_refuse_constant, parse_float=_finite
+            )
+        except (ValueError, RecursionError) as error:
+            raise TraceError(f"metadata 'lae_sim' is not valid JSON: {error}") from error
+        if not isinstance(document, dict):
+            raise TraceError("metadata 'lae_sim' must be a JSON object")
+        if document.get("format") != FORMAT:
+            raise TraceError(f"metadata key 'format' must be {FORMAT!r}")
+        version = document.get("version")
+        if not isinstance(version, str) or not re.match(r"[0-9]{1,6}\.[0-9]{1,6}\Z", version):
+            raise TraceError("metadata key 'version' must be text such as '1.0'")
+        if int(version.split(".")[0]) != 1:
+            raise TraceError(
+                f"the trace has format version {version}, and this lae_sim reads version 1: "
+                "install a lae_sim that knows it"
+            )
+        return cls(_fps(document), _kind(document), _checked(document))
+
+    def dumps(self) -> bytes:
+        """The document as JSON text in UTF-8, keys in order."""
+        return json.dumps(self.document, sort_keys=True, allow_nan=False).encode()
+
+    @property
+    def tracker(self) -> str:
+        """The tracker's name, or ``"unknown"``."""
+        return str(self.document.get("tracker", {}).get("name", "unknown"))
+
+    @property
+    def device(self) -> str:
+        """The device's model, or ``"unknown"``."""
+        return str(self.document.get("device", {}).get("model", "unknown"))
+
+    @property
+    def dataset(self) -> str:
+        """The dataset's name, or ``"unknown"``."""
+        dataset = self.document.get("dataset", {})
+        return str(dataset.get("name", "unknown") if isinstance(dataset, dict) else dataset)
+
+    @property
+    def stride(self) -> Fraction:
+        """Mean frames from one processed frame to the next (see :mod:`lae_sim.replay.strides`)."""
+        return parse_rational(self.document["schedule"].get("stride", "1"))
+
+    @property
+    def profiled(self) -> bool:
+        """Whether the trace names the clock of its times, as those of the profiler do."""
+        return "clock" in self.document.get("timing", {})
+
+    @property
+    def timing_note(self) -> str | None:
+        """What the trace says of times that were not measured, if it does."""
+        note = self.document.get("timing", {}).get("source")
+        return None if note in (None, "measured") else str(note)
+
+    @property
+    def names_attributes(self) -> bool:
+        """Whether any sequence has attributes."""
+        return any(entry.get("attributes") for entry in self.document.get("sequences", {}).values())
+
+    def image_size(self, sequence: str) -> tuple[int, int] | None:
+        """Width and height of the sequence's images in pixels, if known."""
+        size = self._sequence(sequence).get("image_size")
+        return None if size is None else (size[0], size[1])
+
+    def attributes(self, sequence: str) -> tuple[str, ...]:
+        """The dataset's attributes of the sequence, such as ``"Occlusion"``."""
+        return tuple(self._sequence(sequence).get("attributes", ()))
+
+    def _sequence(self, sequence: str) -> Mapping[str, Any]:
+        found: Mapping[str, Any] = self.document.get("sequences", {}).get(sequence, {})
+        return found
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if value in (float("inf"), float("-inf")):
+        raise ValueError(f"{text[:40]} is too large")
+    return value
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _fps(document: Mapping[str, Any]) -> Fraction:
+    fps = document.get("fps")
+    if not isinstance(fps, str):
+        raise TraceError("metadata key 'fps' must be an exact rational as text, such as '30'")
+    try:
+        return parse_fps(fps)
+    except LaeError as error:
+        raise TraceError(f"metadata key 'fps': {error}") from error
+
+
+def _kind(document: Mapping[str, Any]) -> str:
+    schedule = document.get("schedule")
+    kind = schedule.get("kind") if isinstance(schedule, dict) else None
+    if kind not in KINDS:
+        raise TraceError(f"metadata key 'schedule.kind' must be one of {', '.join(KINDS)}")
+    stride = schedule.get("stride", "1") if isinstance(schedule, dict) else "1"
+    try:
+        fits = isinstance(stride, str) and parse_rational(stride) >= 1
+    except LaeError:
+        fits = False
+    if not fits:
+        raise TraceError("metadata key 'schedule.stride' must be text such as '2' or '3/2'")
+    return str(kind)
+
+
+def _checked(document: dict[str, Any]) -> dict[str, Any]:
+    """Check the types of the optional keys that lae_sim reads."""
+    for key in ("tracker", "device", "timing", "sequences"):
+        if not isinstance(document.get(key, {}), dict):
+            raise TraceError(f"metadata key {key!r} must be a JSON object")
+    for name, entry in document.get("sequences", {}).items():
+        where = f"metadata of sequence {name[:80]!r}"
+        if not isinstance(entry, dict):
+            raise TraceError(f"{where} must be a JSON object")
+        size = entry.get("image_size")
+        if size is not None and not (
+            isinstance(size, list)
+            and len(size) == 2
+            and all(type(side) is int and 0 < side < 2**31 for side in size)
+        ):
+            raise TraceError(f"{where}: 'image_size' must be [width, height] in pixels")
+        attributes = entry.get("attributes", [])
+        if not (isinstance(attributes, list) and all(isinstance(a, str) for a in attributes)):
+            raise TraceError(f"{where}: 'attributes' must be a list of names")
+    return document

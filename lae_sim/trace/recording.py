@@ -1,0 +1,110 @@
+"""One sequence of a trace in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sized
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lae_sim._arrays import Floats, Ints
+from lae_sim.engine.scheduler import Schedule
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One sequence of a trace, by world frame.
+
+    Attributes:
+        name: the sequence's name.
+        truth: ground truth boxes ``x, y, w, h`` in pixels, float64 [T, 4]; NaN = none.
+        boxes: the tracker's boxes, float64 [T, 4]; NaN = frame not processed.
+        elapsed_ns: processing times in ns, int64 [T]; -1 = frame not processed.
+        score: the tracker's confidence, float32 [T]; NaN = none.
+    """
+
+    name: str
+    truth: Floats
+    boxes: Floats
+    elapsed_ns: Ints
+    score: npt.NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """Number of world frames T."""
+        return len(self.elapsed_ns)
+
+    @classmethod
+    def new(
+        cls,
+        name: str,
+        truth: npt.ArrayLike,
+        boxes: npt.ArrayLike,
+        elapsed_ns: npt.ArrayLike,
+        score: npt.ArrayLike | None = None,
+    ) -> Recording:
+        """A recording from anything array-like (not copied); ``score`` defaults to none.
+
+        Raises:
+            ValueError: if the lengths differ.
+        """
+        times = np.asarray(elapsed_ns, np.int64)
+        no_score = np.full(len(times), np.nan, np.float32)
+        recording = cls(
+            name,
+            np.asarray(truth, np.float64).reshape(-1, 4),
+            np.asarray(boxes, np.float64).reshape(-1, 4),
+            times,
+            no_score if score is None else np.asarray(score, np.float32),
+        )
+        lengths = {len(recording.truth), len(recording.boxes), len(times), len(recording.score)}
+        if len(lengths) != 1:
+            raise ValueError(f"{name}: truth, boxes, times and scores differ in length: {lengths}")
+        return recording
+
+    @classmethod
+    def of_run(
+        cls,
+        name: str,
+        schedule: Schedule,
+        boxes: Floats,
+        truth: Floats,
+        score: npt.NDArray[np.float32] | None = None,
+    ) -> Recording:
+        """The real-time recording of a schedule.
+
+        Args:
+            name: the sequence's name.
+            schedule: what the engine returned.
+            boxes: the box of each processed frame, float64 [n, 4].
+            truth: ground truth of every world frame, float64 [T, 4].
+            score: the confidence of each processed frame, float32 [n], if known.
+        """
+        all_boxes = np.full((schedule.length, 4), np.nan)
+        elapsed = np.full(schedule.length, -1, np.int64)
+        all_scores = np.full(schedule.length, np.nan, np.float32)
+        all_boxes[schedule.frames] = boxes
+        all_scores[schedule.frames] = np.nan if score is None else score
+        elapsed[schedule.frames] = schedule.elapsed_ns
+        return cls.new(name, truth, all_boxes, elapsed, all_scores)
+
+
+BATCH_ROWS = 1 << 15
+
+
+Item = TypeVar("Item", bound=Sized)
+
+
+def batched(items: Iterable[Item], frames: int = BATCH_ROWS) -> Iterator[list[Item]]:
+    """Recordings or runs in groups of about ``frames`` world frames together."""
+    group: list[Item] = []
+    pending = 0
+    for item in items:
+        group.append(item)
+        pending += len(item)
+        if pending >= frames:
+            yield group
+            group, pending = [], 0
+    if group:
+        yield group

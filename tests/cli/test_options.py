@@ -1,0 +1,93 @@
+from fractions import Fraction
+
+import pytest
+
+import lae_sim
+from lae_sim.replay.latency import bootstrap
+from lae_sim.replay.world import parse_latency, parse_policy
+
+RECORDING = lae_sim.Recording.new(
+    "sequence", [[0, 0, 1, 1]] * 4, [[0, 0, 1, 1]] * 4, [90_000_000, 40_000_000, 30_000_000, 2]
+)
+
+
+def times(source):
+    service = source(RECORDING)
+    return [service(frame) for frame in (0, 2, 3)]
+
+
+def test_latencies_by_name():
+    assert times(parse_latency("recorded")) == [90_000_000, 30_000_000, 2]
+    assert times(parse_latency("by-call")) == [90_000_000, 40_000_000, 30_000_000]
+    assert times(parse_latency("constant:4.7us")) == [4700, 4700, 4700]
+    assert times(parse_latency("resample:3")) == times(lae_sim.resampled(3))
+    assert times(parse_latency("lognormal:3")) == times(lae_sim.lognormal(3))
+    assert times(parse_latency("bootstrap:3")) == times(bootstrap(3))
+    assert times(parse_latency("bootstrap:3:1")) == times(bootstrap(3, 1))
+
+
+OWN = """
+class Slowly:
+    def __call__(self, clock, calls):
+        return calls[-1][0] + 9, calls[-1][2] + 9 * clock.frame_ticks
+
+at_once = Slowly()
+
+def double(recording):
+    return lambda frame: 2 * int(recording.elapsed_ns[frame])
+"""
+
+
+@pytest.mark.parametrize("name", ["Slowly", "at_once"])
+def test_a_policy_of_ones_own(name, tmp_path, monkeypatch):
+    (tmp_path / "own_rules.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    policy, at_arrival = parse_policy(f"own_rules:{name}")
+    assert policy(lae_sim.Clock.at(Fraction(1)), [(0, 0, 7)]) == (9, 9_000_000_007)
+    assert not at_arrival
+
+
+def test_a_latency_of_ones_own(tmp_path, monkeypatch):
+    (tmp_path / "own_rules.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    assert times(parse_latency("own_rules:double")) == [180_000_000, 60_000_000, 4]
+    with pytest.raises(lae_sim.LaeError, match=r"latency 'own_rules:triple': .*triple"):
+        parse_latency("own_rules:triple")
+
+
+def test_policies_by_name():
+    clock = lae_sim.Clock.at(Fraction(10))
+    calls = [(0, 0, 3_500_000_000)]  # free half-way between frames 3 and 4
+    expected = {
+        "latest": (3, 3_500_000_000),
+        "fifo": (1, 3_500_000_000),
+        "every:2": (2, 3_500_000_000),
+        "shrinking-tail:160ms": (4, 4_000_000_000),
+        "shrinking-tail:110ms": (3, 3_500_000_000),
+        "vot-realtime:0": (3, 3_000_000_000),
+        "vot-realtime:1": (1, 1_000_000_000),
+        "vot-realtime": (1, 1_000_000_000),
+    }
+    for text, following in expected.items():
+        policy, at_arrival = parse_policy(text)
+        assert policy(clock, calls) == following, text
+        assert at_arrival == text.startswith("vot")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "Latest", "latest:1", "every", "every:-1", "every:x", "shrinking-tail", "fifo:2",
+             "vot-realtime:x", "every:99999999999999999999", "no_such_module:policy"]
+)  # fmt: skip
+def test_a_policy_that_is_none_is_an_error_that_quotes_it(text):
+    with pytest.raises(lae_sim.LaeError, match=r"every|policy|vot"):
+        parse_policy(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "constant", "constant:47", "constant:0.1ns", "resample:", "resample:-1",
+             "by-call:2", "lognormal:1.5", "normal:1", "bootstrap", "bootstrap:1:0",
+             "bootstrap:1:2:3", "bootstrap::3", "recorded:json", "no_such_module:source"]
+)  # fmt: skip
+def test_a_latency_that_is_none_is_an_error(text):
+    with pytest.raises(lae_sim.LaeError):
+        parse_latency(text)

@@ -1,0 +1,398 @@
+"""``lae-sim profile`` and ``lae-sim fidelity`` as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from fakes import bright_frame
+from places import REPOSITORY
+
+from lae_sim.replay.run import replay_trace
+from lae_sim.trace.file import read_trace, validate
+
+TRACKERS = """
+import os, sys, time
+import numpy as np
+
+
+class Bright:
+    \"\"\"Finds the bright target, where told to be slow slowly, and fails where told to.\"\"\"
+
+    def __init__(self, ms=0.0, fail_at=-1, how="raise", reach=1000.0):
+        self.ms, self.fail_at, self.how, self.reach = ms, fail_at, how, reach
+
+    def describe(self):
+        return {"name": "bright", "version": "1", "settings": {"reach": self.reach}}
+
+    def init(self, frame, box):
+        self.calls, self.box = 0, list(box)
+
+    def track(self, frame):
+        self.calls += 1
+        if frame[0, 0, 0] == 99 and self.calls == self.fail_at:
+            if self.how == "raise":
+                raise ValueError("lost my mind")
+            if self.how == "hang":
+                time.sleep(60)
+            if self.how == "exit":
+                os._exit(3)
+            return {"nan": [float("nan")] * 4, "none": None}[self.how]
+        time.sleep(self.ms / 1000)
+        rows, columns = np.nonzero(frame[:, :, 0] == 200)
+        x, y = columns.min(), rows.min()
+        if abs(x - self.box[0]) > self.reach:
+            return None
+        self.box = [x, y, 12, 10]
+        return self.box, 0.5
+
+
+class Searching(Bright):
+    def set_search(self, cx, cy, w, h):
+        self.box = [cx - 6, cy - 5, 12, 10]
+"""
+
+
+def make_dataset(root: Path, lengths: dict[str, int], step: float = 2.0) -> Path:
+    """Folders of PNG images; those of ``bad`` carry a mark that the trackers look for."""
+    for name, length in lengths.items():
+        folder = root / name / "img"
+        folder.mkdir(parents=True)
+        boxes = []
+        for i in range(length):
+            x = 5 + step * i
+            frame = bright_frame(x, 20, size=(160, 64))
+            frame[0, 0] = 99 if name == "bad" else 0
+            cv2.imwrite(str(folder / f"{i + 1:04}.png"), frame)
+            boxes.append(f"{x:g},20,12,10")
+        (root / name / "groundtruth_rect.txt").write_text("\n".join(boxes) + "\n")
+    return root
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Path:
+    """A folder with a dataset of three sequences and a module of trackers."""
+    make_dataset(tmp_path / "data", {"a": 20, "bad": 24, "c": 16})
+    (tmp_path / "mine.py").write_text(TRACKERS)
+    return tmp_path
+
+
+def start(here: Path, *arguments: str, module: str = "profile", **more: Any) -> subprocess.Popen:
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    return subprocess.Popen(
+        [sys.executable, "-W", "error", "-m", "lae_sim", module, *arguments],
+        cwd=here,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **more,
+    )
+
+
+def profile(here: Path, *arguments: str, status: int = 0, **more: Any) -> tuple[str, str]:
+    process = start(here, *arguments, **more)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == status, (out, err)
+    assert "Traceback" not in err
+    return out, err
+
+
+MINE = ("--tracker", "mine:Bright", "--root", "data")
+
+
+def test_a_profile_becomes_a_trace_with_its_provenance(here: Path) -> None:
+    out, _ = profile(here, *MINE, "--option", "ms=1.5", "--out", "t.parquet", "--threads", "1")
+    assert "lae-sim replay t.parquet" in out
+    validate(here / "t.parquet")
+    trace = read_trace(here / "t.parquet")
+    recordings = {recording.name: recording for recording in trace}
+    assert list(recordings) == ["a", "bad", "c"]
+    for recording in recordings.values():
+        np.testing.assert_array_equal(recording.boxes, recording.truth)
+        assert (recording.elapsed_ns[1:] >= 1_500_000).all()
+        assert np.isnan(recording.score[0])
+        assert (recording.score[1:] == 0.5).all()
+    document = trace.metadata.document
+    assert document["schedule"] == {"kind": "every-frame"}
+    assert document["tracker"]["settings"] == {"reach": 1000.0}
+    assert document["timing"]["source"] == "measured"
+    assert document["timing"]["warmup_calls"] == 5
+    assert document["timing"]["threads"]
+    assert document["sequences"]["c"]["order"] == 2
+    assert document["sequences"]["c"]["image_size"] == [160, 64]
+    assert {"before", "during", "after"} == set(document["device"]["readings"])
+    assert document["lae_sim"]["version"]
+    assert not list(here.glob("*unfinished*"))
+
+
+def test_json_says_the_same(here: Path) -> None:
+    passes = ("--stride", "2", "--stride", "3", "--closed-loop", "constant:0.5ms")
+    out, _ = profile(here, *MINE, "--sequence", "a", "--json", "--in-process", *passes)
+    report = json.loads(out)
+    assert [trace["trace"] for trace in report["traces"]] == [
+        "mine-Bright-data.parquet",
+        "mine-Bright-data.stride2.parquet",
+        "mine-Bright-data.stride3.parquet",
+        "mine-Bright-data.closed-loop-0.5ms.parquet",
+    ]
+    assert report["traces"][0]["world_frames"] == report["traces"][0]["processed"] == 20
+    assert report["failures"] == []
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ("raise", "ValueError: lost my mind"),
+        ("hang", "exceeded|longer|took"),
+        ("exit", "exit|3"),
+        ("nan", "nan"),
+    ],
+)
+def test_a_failing_tracker_costs_its_sequence(here: Path, how: str, reason: str) -> None:
+    options = ("--option", "fail_at=9", f"how={how}", "--frame-timeout", "600ms")
+    out, err = profile(here, *MINE, *options, "--out", "t.parquet", "--json", status=1)
+    (failure,) = json.loads(out)["failures"]
+    assert failure["sequence"] == "bad"
+    import re
+
+    assert re.search(reason, failure["reason"])
+    assert "bad" in err
+    trace = read_trace(here / "t.parquet")
+    assert [recording.name for recording in trace] == ["a", "c"]
+    assert trace.metadata.document["failures"] == [failure]
+
+
+def test_a_frame_without_an_answer_costs_that_frame(here: Path) -> None:
+    out, _ = profile(
+        here, *MINE, "--option", "fail_at=9", "how=none", "--out", "t.parquet", "--json"
+    )
+    assert json.loads(out)["traces"][0]["lost"] == 1
+    trace = read_trace(here / "t.parquet")
+    bad = {recording.name: recording for recording in trace}["bad"]
+    np.testing.assert_array_equal(bad.boxes[9], bad.boxes[8])
+    assert trace.metadata.document["sequences"]["bad"]["lost"] == 1
+
+
+def test_real_time_skips_frames_and_replays_to_the_bit(here: Path) -> None:
+    options = ("--mode", "real-time", "--option", "ms=45", "--out", "t.parquet")
+    profile(here, *MINE, *options, "--sequence", "a")
+    trace = read_trace(here / "t.parquet")
+    assert trace.metadata.kind == "real-time"
+    (run,) = replay_trace(trace)
+    assert run.departures == 0
+    assert len(run.schedule.frames) < 16
+    np.testing.assert_array_equal(
+        run.schedule.frames, np.flatnonzero(run.recording.elapsed_ns >= 0)
+    )
+
+
+def test_the_closed_loop_by_search_and_by_translation(here: Path) -> None:
+    make_dataset(here / "fast", {"f": 28}, step=5)
+    shared = ("--root", "fast", "--timing", "constant:100ms", "--option", "reach=9")
+    lost = {}
+    for name, options in {
+        "plain": ("--tracker", "mine:Searching"),
+        "native": ("--tracker", "mine:Searching", "--pre-forecaster", "truth:Path"),
+        "translation": ("--tracker", "mine:Bright", "--pre-forecaster", "truth:Path"),
+    }.items():
+        (here / "truth.py").write_text(
+            "class Path:\n"
+            "    def __init__(self, box, image_size=None): pass\n"
+            "    def update(self, frame, box): pass\n"
+            "    def predict(self, frame): return [5 + 5 * frame, 20, 12, 10]\n"
+        )
+        out, _ = profile(here, *options, *shared, "--out", f"{name}.parquet", "--json")
+        report = json.loads(out)["traces"][0]
+        lost[name] = report["lost"]
+        schedule = read_trace(here / f"{name}.parquet").metadata.document["schedule"]
+        assert schedule.get("search") == (None if name == "plain" else name)
+        assert report["timing"] == "constant 100ms, not measured"
+    assert lost == {"plain": 9, "native": 0, "translation": 0}
+
+
+def test_another_devices_trace_drives_the_schedule(here: Path) -> None:
+    profile(here, *MINE, "--option", "ms=90", "--sequence", "a", "--out", "slow.parquet")
+    profile(here, *MINE, "--timing", "slow.parquet", "--sequence", "a", "--out", "t.parquet")
+    (slow,), (run,) = (
+        read_trace(here / "slow.parquet"),
+        replay_trace(read_trace(here / "t.parquet")),
+    )
+    frames = run.schedule.frames
+    assert len(frames) < 10
+    np.testing.assert_array_equal(run.recording.elapsed_ns[frames], slow.elapsed_ns[frames])
+    _, err = profile(here, *MINE, "--timing", "slow.parquet", status=1)
+    assert "no times of sequence 'bad'" in err
+
+
+def test_kill_and_resume(here: Path) -> None:
+    options = (*MINE, "--option", "ms=20", "--out", "t.parquet", "--warmup", "0")
+    process = start(here, *options)
+    kept = here / "t.unfinished" / "first"
+    deadline = time.monotonic() + 60
+    while not list(kept.glob("[!.]*.parquet")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.kill()
+    process.communicate()
+    before = {path.name: path.stat().st_mtime_ns for path in kept.glob("[!.]*.parquet")}
+    assert before
+    assert not (here / "t.parquet").exists()
+    _, err = profile(here, *options, status=2)
+    assert "--resume" in err
+    _, err = profile(here, *options[:-1], "1", "--resume", status=2)
+    assert "warmup" in err
+    _, err = profile(here, *options, "--tracker", "mine:Searching", "--resume", status=2)
+    assert "tracker 'mine:Bright', not 'mine:Searching'" in err
+    process = start(here, *options, "--resume")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a", "bad", "c"]
+    assert not kept.parent.exists()
+    _, err = profile(here, *options, "--resume")
+    assert "complete" in err
+
+
+def test_ctrl_c_keeps_what_is_complete(here: Path) -> None:
+    options = (*MINE, "--option", "ms=30", "--out", "t.parquet", "--warmup", "0")
+    process = start(here, *options, start_new_session=True)
+    deadline = time.monotonic() + 60
+    while not list(here.glob("t.unfinished/first/[!.]*.parquet")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Traceback" not in err
+    assert "--resume" in err
+    names = [recording.name for recording in read_trace(here / "t.parquet")]
+    assert names
+    assert names == ["a", "bad", "c"][: len(names)]
+    profile(here, *options, "--resume")
+    assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a", "bad", "c"]
+
+
+def test_a_full_disk_is_an_error_and_leaves_no_trace(here: Path) -> None:
+    def little_space() -> None:
+        import resource
+
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+
+    _, err = profile(
+        here, *MINE, "--out", "t.parquet", "--in-process", status=2, preexec_fn=little_space
+    )
+    assert "cannot write" in err
+    assert not (here / "t.parquet").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--tracker", "nothing"), "no tracker 'nothing'"),
+        (("--tracker", "mine:Nothing"), "Nothing"),
+        (("--tracker", "mine:Bright", "--option", "colour=red"), "colour.*takes ms, fail_at"),
+        (("--tracker", "mine:Bright", "--option", "colour"), "not key=value"),
+        (("--root", "nowhere"), "nowhere"),
+        (("--root", "data", "--sequence", "d"), "'d'"),
+        (("--dataset", "DTB70"), "--root"),
+        ((*MINE, "--box", "1,2,3"), "not a box"),
+        ((*MINE, "--mode", "every-frame", "--policy", "fifo"), "real-time"),
+        ((*MINE, "--timing", "nothing.parquet"), "nothing.parquet"),
+        ((*MINE, "--timing", "constant:47"), "unit"),
+        ((*MINE, "--stride", "1"), "above 1"),
+        ((*MINE, "--stride", "two"), "exact number"),
+        ((*MINE, "--translate"), "pre-forecaster"),
+        ((*MINE, "--pre-forecaster", "crystal-ball"), "crystal-ball"),
+        ((*MINE, "--out", "trace.txt"), "parquet"),
+        ((*MINE, "--out", "no/folder/t.parquet"), "no/folder"),
+        ((*MINE, "--python", "/nowhere/python"), "/nowhere/python"),
+    ],
+)
+def test_bad_input_is_one_clear_error(here: Path, arguments: tuple[str, ...], message: str) -> None:
+    import re
+
+    _, err = profile(here, *arguments, status=2)
+    assert re.search(message, err.replace("\n", " ")), err
+    assert not list(here.glob("*.parquet"))
+    assert not list(here.glob("*.unfinished"))
+
+
+def test_an_unreadable_image_costs_its_sequence(here: Path) -> None:
+    (here / "data" / "bad" / "img" / "0012.png").write_bytes(b"not an image")
+    out, err = profile(here, *MINE, "--json", status=1)
+    (failure,) = json.loads(out)["failures"]
+    assert "0012.png" in failure["reason"]
+    assert "'bad', frame 11" in err
+
+
+def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
+    make_dataset(here / "fast", {"f": 40, "g": 30}, step=3)
+    options = (
+        "--tracker",
+        "mine:Bright",
+        "--root",
+        "fast",
+        "--option",
+        "reach=8",
+        "--out",
+        "t.parquet",
+    )
+    loops = (
+        "--stride",
+        "2",
+        "3",
+        "--closed-loop",
+        "constant:20ms",
+        "constant:47ms",
+        "constant:100ms",
+    )
+    out, _ = profile(here, *options, *loops)
+    command = next(line for line in out.splitlines() if "lae-sim fidelity" in line)
+    arguments = command.split()[2:]
+    process = start(here, *arguments, "--json", "--forecaster", "hold", "kalman", module="fidelity")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    rows = {
+        (row["closed_loop"], row["replay"]): row
+        for row in json.loads(out)["summary"]
+        if row["forecaster"] == "hold"
+    }
+    assert len(rows) == 6
+    # at 20 ms nothing is skipped, and every third frame is a pass of its own
+    for replay in ("every-frame", "strided"):
+        assert rows["t.closed-loop-20ms.parquet", replay]["max_abs_d_auc"] == 0
+    assert rows["t.closed-loop-100ms.parquet", "strided"]["max_abs_d_auc"] == 0
+    # a target that goes 9 pixels in three frames is lost by a tracker that reaches 8
+    assert rows["t.closed-loop-100ms.parquet", "every-frame"]["mean_abs_d_dp20"] > 0.2
+    process = start(here, *arguments, "--per-sequence", module="fidelity")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert "strided" in out
+    passes = ("--strided", "t.stride2.parquet", "t.stride3.parquet")
+    slow = ("--latency", "constant:47ms", "--json", "--per-sequence")
+    process = start(here, "t.parquet", *passes, *slow, module="replay")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    (report,) = json.loads(out)["traces"]
+    assert report["strided"] == list(passes[1:])
+    # steps of 1 and 2 by turns are nearest to every frame, and the tracker answers alike
+    for row in report["results"][0]["per_sequence"]:
+        assert row["disagreement"] == 0 < row["approximate_outputs"]
+    assert not report["exact"]
+    profile(here, *options[:-1], "u.parquet", "--option", "reach=9")
+    process = start(here, "u.parquet", *arguments[1:], module="fidelity")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert "same tracker" in err
+    process = start(here, "t.parquet", "--closed-loop", "t.parquet", module="fidelity")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert "no closed loop" in err

@@ -1,0 +1,471 @@
+"""The replay command line as a user runs it: subprocesses, files, exit statuses."""
+
+import json
+import os
+import subprocess
+import sys
+from fractions import Fraction
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from places import REPOSITORY
+
+import lae_sim
+from lae_sim.evaluation.events import KINDS
+from lae_sim.report.figures import sweep_figure
+
+SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
+FAST = REPOSITORY / "traces" / "synthetic-fast.parquet"
+REAL_TIME = REPOSITORY / "traces" / "synthetic-slow-realtime.parquet"
+CONFORMANCE = sorted((REPOSITORY.parent / "shared" / "conformance").glob("*.json"))
+
+
+def replay(*arguments, cwd=None, status=0):
+    """Run the command and return what it printed; its error text if it fails as expected."""
+    command = [sys.executable, "-W", "error", "-m", "lae_sim", "replay", *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=cwd, env=environment, timeout=120
+    )
+    assert done.returncode == status, done.stderr
+    if status:
+        assert "Traceback" not in done.stderr
+        assert len(done.stderr.strip().splitlines()[-2:]) <= 2
+        return done.stderr
+    assert done.stderr == ""  # no progress bar where nobody looks
+    return done.stdout
+
+
+def replay_json(*arguments, **how):
+    return json.loads(replay(*arguments, "--json", **how))
+
+
+@pytest.mark.skipif(not CONFORMANCE, reason="the shared conformance cases are not here")
+@pytest.mark.parametrize("path", CONFORMANCE, ids=lambda path: path.stem)
+def test_conformance_cases_through_the_command_line(path, tmp_path):
+    case = json.loads(path.read_text())
+    expected = case["expected"]
+    none = [np.nan] * 4
+    truth = [none if box is None else box for box in case["truth"]]
+    recording = lae_sim.Recording.new("case", truth, case["boxes"], case["elapsed_ns"])
+    metadata = lae_sim.Metadata.new(case["fps"], "every-frame")
+    trace = tmp_path / "case.parquet"
+    lae_sim.write_trace(lae_sim.Trace(metadata, [recording]), trace)
+    outputs, schedule = tmp_path / "outputs.parquet", tmp_path / "schedule.parquet"
+    sigmas = list(expected["paired"])
+    options = ["--forecaster", "hold", "kalman", "--sigma", *sigmas]
+    options += ["--outputs", outputs, "--schedule", schedule]
+    reports = {
+        name: replay_json(trace, *options, "--convention", name)["traces"][0]
+        for name in ("pysot", "exclude")
+    }
+
+    stored = pq.read_table(schedule)
+    assert stored.schema.metadata[b"ticks_per_ns"] == str(expected["ticks_per_ns"]).encode()
+    columns = [stored[name].to_pylist() for name in ("frame", "start_ticks", "ready_ticks")]
+    assert [list(row) for row in zip(*columns)] == expected["processed"]
+    answered = pq.read_table(outputs).to_pandas()
+    for sigma in sigmas:
+        at_sigma = answered[answered.sigma == float(Fraction(sigma))]
+        held = at_sigma[at_sigma.forecaster == "hold"]
+        assert held.source_frame.tolist() == expected["paired"][sigma]
+        forecast = at_sigma[at_sigma.forecaster == "kalman"][["x", "y", "w", "h"]].to_numpy()
+        np.testing.assert_allclose(forecast, expected["kalman"][sigma], rtol=0, atol=1e-6)
+        for convention, report in reports.items():
+            for result in report["results"]:
+                if result["sigma"] == float(Fraction(sigma)):
+                    figures = expected["metrics"][sigma][result["forecaster"]][convention]
+                    for metric, value in figures.items():
+                        assert result[metric] == pytest.approx(value, rel=0, abs=1e-9)
+    pairs = expected["paired"]["0"]
+    assert reports["pysot"]["mismatch_sum"] == sum(i - j for i, j in enumerate(pairs))
+    assert reports["pysot"]["processed"] == len(expected["processed"])
+
+
+def test_the_table_has_a_line_for_each_trace_and_forecaster():
+    text = replay(SLOW, FAST, "--forecaster", "hold", "constant-velocity", "kalman")
+    lines = [line.split() for line in text.splitlines() if line.startswith("synthetic-")]
+    assert [line[:2] for line in lines] == [
+        [f"synthetic-{speed}.parquet", forecaster]
+        for speed in ("slow", "fast")
+        for forecaster in ("hold", "constant-velocity", "kalman")
+    ]
+    assert "convention pysot, policy latest, latency recorded" in text
+    assert "approximate: 637 outputs (38.2%)" in text
+    assert "times: synthetic" in text
+
+
+def test_json_agrees_with_the_api():
+    report = replay_json(SLOW, "--latency", "constant:47ms", "--sigma", "0", "1/2")["traces"][0]
+    trace = lae_sim.read_trace(SLOW)
+    runs = lae_sim.replay_trace(trace, source=lae_sim.constant(47_000_000))
+    forecasters = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
+    sigmas = [Fraction(0), Fraction(1, 2)]
+    found = lae_sim.evaluate(runs, trace.metadata, forecasters, sigmas)
+    assert report["world_frames"] == found.frames.sum() == trace.frames
+    assert report["processed"] == found.processed.sum()
+    assert report["mismatch_sum"] == found.mismatch_sum[:, 0].sum()
+    assert [(r["forecaster"], r["sigma"]) for r in report["results"]] == [
+        ("hold", 0.0), ("hold", 0.5), ("kalman", 0.0), ("kalman", 0.5),
+    ]  # fmt: skip
+    auc = [result["auc"] for result in report["results"]]
+    np.testing.assert_allclose(auc, found.scores["auc"].mean(axis=1).ravel(), rtol=0, atol=1e-12)
+    hold, kalman = report["results"][0], report["results"][2]
+    loss = report["offline"]["auc"] - hold["auc"]
+    assert kalman["recovered_auc"] == pytest.approx((kalman["auc"] - hold["auc"]) / loss)
+    assert hold["recovered_auc"] is None
+    assert hold["age_ms"] == pytest.approx(hold["mismatch_mean"] * 1000 / 30)
+
+
+def test_the_sigma_grid_adds_plain_means():
+    report = replay_json(SLOW, "--sigma-grid")["traces"][0]
+    for name in ("hold", "kalman"):
+        results = [result for result in report["results"] if result["forecaster"] == name]
+        assert [round(result["sigma"] * 50) for result in results] == list(range(51))
+        assert results[0]["mauc"] == pytest.approx(np.mean([r["auc"] for r in results]))
+        assert results[0]["mdp"] == pytest.approx(np.mean([r["dp20"] for r in results]))
+    assert "mAUC" in replay(SLOW, "--sigma-grid")
+    assert "mauc" not in replay_json(SLOW)["traces"][0]["results"][0]
+
+
+def test_eta_is_sigma_with_the_other_sign():
+    with_eta = replay_json(SLOW, "--eta", "1/2")["traces"][0]["results"]
+    assert with_eta == replay_json(SLOW, "--sigma=-1/2")["traces"][0]["results"]
+    assert with_eta[0]["sigma"] == -0.5
+
+
+def test_times_of_another_device():
+    report = replay_json(SLOW, "--timing", FAST)["traces"][0]
+    assert report["times_from"] == str(FAST)
+    assert report["processed"] == replay_json(FAST)["traces"][0]["processed"]
+    assert report["offline"] == replay_json(SLOW)["traces"][0]["offline"]
+
+
+def test_a_real_time_trace_is_exact_as_it_was_recorded_and_refuses_other_frames():
+    report = replay_json(REAL_TIME)["traces"][0]
+    offline_known = replay_json(SLOW)["traces"][0]
+    assert report["exact"]
+    assert report["offline"] is None
+    assert report["results"][0]["auc"] == offline_known["results"][0]["auc"]
+    error = replay(REAL_TIME, "--latency", "constant:10ms", status=2)
+    assert "'bike-pan', frame 1" in error
+    assert "the trace has no box for it" in error
+
+
+@pytest.mark.parametrize("policy", ["fifo", "every:2", "shrinking-tail:47ms", "vot-realtime"])
+def test_policies_by_name(policy):
+    report = replay_json(SLOW, "--policy", policy)["traces"][0]
+    name = policy.split(":")[0]
+    by_name = {
+        "fifo": lae_sim.fifo,
+        "every": lae_sim.every(2),
+        "shrinking-tail": lae_sim.shrinking_tail(47_000_000),
+        "vot-realtime": lae_sim.vot_realtime(),
+    }
+    runs = list(lae_sim.replay_trace(lae_sim.read_trace(SLOW), policy=by_name[name]))
+    assert report["policy"] == policy
+    assert report["processed"] == sum(len(run.schedule.frames) for run in runs)
+
+
+def test_vot_realtime_says_that_it_never_scores_latency():
+    assert "never scores latency" in replay(SLOW, "--policy", "vot-realtime")
+    vot, plain = (
+        replay_json(SLOW, "--policy", name)["traces"][0] for name in ("vot-realtime", "latest")
+    )
+    assert vot["results"][0]["auc"] > plain["results"][0]["auc"] + 0.1
+
+
+@pytest.mark.parametrize("latency", ["resample:7", "lognormal:7", "by-call", "constant:47ms"])
+def test_latencies_by_name_are_deterministic_whatever_the_sequences(latency):
+    everything = replay_json(SLOW, "--latency", latency, "--per-sequence")["traces"][0]
+    again = replay_json(SLOW, "--latency", latency, "--per-sequence")["traces"][0]
+    assert everything == again
+    chosen = ("--sequence", "truck-far", "car-chase")
+    some = replay_json(SLOW, "--latency", latency, "--per-sequence", *chosen)["traces"][0]
+    for result, whole in zip(some["results"], everything["results"]):
+        by_name = {one["sequence"]: one for one in whole["per_sequence"]}
+        assert [one["sequence"] for one in result["per_sequence"]] == ["car-chase", "truck-far"]
+        assert all(one == by_name[one["sequence"]] for one in result["per_sequence"])
+
+
+def test_another_frame_rate_and_an_exact_scale():
+    slower = replay_json(SLOW, "--fps", "30000/1001", "--latency-scale", "1/3")["traces"][0]
+    assert (slower["fps"], slower["latency_scale"]) == ("30000/1001", "1/3")
+    assert slower["processed"] > 2300
+
+
+def test_attributes_and_sequences_have_their_tables():
+    text = replay(SLOW, "--attributes", "--per-sequence")
+    assert "Fast camera motion  hold" in text
+    assert "car-chase     kalman" in text
+    report = replay_json(SLOW, "--attributes")["traces"][0]
+    scores = report["results"][1]["attributes"]["Occlusion"]
+    assert scores["sequences"] == 3
+    per_sequence = replay_json(SLOW, "--per-sequence")["traces"][0]["results"][1]["per_sequence"]
+    names = ("car-occluded", "person-crowd", "runner-zoom")
+    mean = np.mean([one["auc"] for one in per_sequence if one["sequence"] in names])
+    assert scores["auc"] == pytest.approx(mean)
+
+
+def test_result_text_files_score_as_the_table_says(tmp_path):
+    replay(SLOW, "--export-txt", tmp_path / "results", "--sigma", "0", "1")
+    folders = sorted(path.name for path in (tmp_path / "results").iterdir())
+    assert folders == [
+        "synthetic-slow-hold", "synthetic-slow-hold-sigma1",
+        "synthetic-slow-kalman", "synthetic-slow-kalman-sigma1",
+    ]  # fmt: skip
+    results = replay_json(SLOW)["traces"][0]["results"]
+    for name, result in zip(("hold", "kalman"), results):
+        scores = []
+        for recording in lae_sim.read_trace(SLOW):
+            path = tmp_path / "results" / f"synthetic-slow-{name}" / f"{recording.name}.txt"
+            boxes = np.loadtxt(path, delimiter=",")
+            assert boxes.shape == (len(recording), 4)
+            pysot = lae_sim.CONVENTIONS["pysot"]
+            scores.append(lae_sim.success_curve(recording.truth, boxes, pysot).mean())
+        assert np.mean(scores) == pytest.approx(result["auc"], abs=1e-12)
+    error = replay(SLOW, "--export-txt", tmp_path / "results", status=2)
+    assert "is there already" in error
+
+
+def test_the_event_log_tells_the_same_story_as_the_schedule(tmp_path):
+    path, schedule = tmp_path / "events.jsonl", tmp_path / "schedule.parquet"
+    replay(SLOW, "--events", path, "--schedule", schedule, "--sequence", "boat-calm")
+    events = [json.loads(line) for line in path.read_text().splitlines()]
+    ticks = [event["tick"] for event in events]
+    assert ticks == sorted(ticks)
+    rows = pq.read_table(schedule).to_pylist()
+    for kind, column in (("processing started", "start_ticks"), ("output ready", "ready_ticks")):
+        logged = [(e["frame"], e["tick"]) for e in events if e["event"] == kind]
+        assert logged == [(row["frame"], row[column]) for row in rows]
+    count = {kind: sum(e["event"] == kind for e in events) for kind in KINDS}
+    assert count["frame arrived"] == count["query answered"] == 300
+    assert count["frame skipped"] == 300 - len(rows)
+    queries = [event for event in events if event["event"] == "query answered"]
+    sources = [event["source_frame"] for event in queries]
+    assert count["forecaster updated"] == len(set(sources) - {0})
+
+
+def test_a_picture(tmp_path):
+    replay(SLOW, FAST, "--plot", tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert "name a .png" in replay(SLOW, "--plot", tmp_path / "curves.txt", status=2)
+    assert [path.name for path in tmp_path.iterdir()] == ["curves.png"]
+
+
+def test_a_sweep_is_the_single_replays_one_after_another(tmp_path):
+    options = ("--per-sequence", "--cost", "kalman=2ms", "--sigma", "0", "1/2")
+    swept = replay_json(SLOW, FAST, "--fps", "60", "30", "--latency-scale", "1", "2", *options)
+    settings = [(each["fps"], each["latency_scale"]) for each in swept["traces"][:4]]
+    assert settings == [("60", "1"), ("60", "2"), ("30", "1"), ("30", "2")]
+    for k, (trace, fps, scale) in {1: (SLOW, "60", "2"), 6: (FAST, "30", "1")}.items():
+        alone = replay_json(trace, "--fps", fps, "--latency-scale", scale, *options)
+        assert swept["traces"][k] == alone["traces"][0]
+    # twice the rate is twice the time that everything takes
+    scores = [[r["auc"] for r in each["results"] if r["forecaster"] == "hold"]
+              for each in swept["traces"]]  # fmt: skip
+    assert scores[0] == scores[3]
+
+
+def test_a_sweep_has_columns_and_says_what_it_is_of():
+    text = replay(SLOW, "--fps", "15", "30000/1001", "--attributes", "--per-sequence")
+    tables = [line for line in text.splitlines() if "forecaster" in line]
+    assert len(tables) == 5
+    assert all(line.split()[2] == "fps" for line in tables)
+    assert any(line.split()[1:3] == ["hold", "30000/1001"] for line in text.splitlines())
+    assert "a sweep of the rate is one of how fast the world moves" in text
+    text = replay(SLOW, "--latency-scale", "1/2", "2")
+    assert text.split()[2] == "scale"
+    assert "how fast the world moves" not in text
+    assert "how fast the world moves" in " ".join(replay("--help").split())
+
+
+def test_what_forecasting_costs_is_measured_once_in_a_sweep():
+    found = replay_json(SLOW, "--latency-scale", "1", "2", "--cost", "measured")["traces"]
+    assert found[0]["forecaster_cost_ns"] == found[1]["forecaster_cost_ns"]
+
+
+def test_the_picture_of_a_sweep(tmp_path):
+    both = ("--fps", "60", "15", "30", "--latency-scale", "1", "2")
+    replay(SLOW, *both, "--plot", tmp_path / "both.svg")
+    text = (tmp_path / "both.svg").read_text()
+    for written in ("world frame rate (fps)", "times x 2", "offline", "kalman", "AUC"):
+        assert f"<!-- {written} -->" in text
+    reports = replay_json(SLOW, REAL_TIME, *both[:4], "--sigma", "0", "1", "--policy", "latest",
+        "--sequence", "boat-calm", "--latency", "constant:40s")["traces"]  # fmt: skip
+    labels = ["a", "a", "a", "b", "b", "b"]
+    figure = sweep_figure(reports, labels, 1.0, ["fps"])
+    assert [axes.get_title() for axes in figure.axes] == ["a", "a", "b", "b"]
+    assert [len(axes.lines) for axes in figure.axes] == [3, 3, 2, 2]  # b lacks frames
+    line = figure.axes[0].lines[1]
+    assert (line.get_label(), line.get_xdata().tolist()) == ("kalman", [15, 30, 60])
+    expected = [r["auc"] for k in (1, 2, 0) for r in reports[k]["results"][3:]]
+    assert line.get_ydata().tolist() == expected
+
+
+FORECASTER = """
+class Still:
+    def __init__(self, box, image_size=None):
+        self.box = box
+        self.size = image_size
+    def update(self, frame, box):
+        self.box = box
+    def predict(self, frame):
+        assert self.size == (1280, 720)
+        return self.box
+def one_argument(box):
+    pass
+def broken(box, image_size=None):
+    class Broken(Still):
+        def predict(self, frame):
+            return [1.0, 2.0, float("nan"), 4.0]
+    return Broken(box, image_size)
+"""
+
+
+def test_a_forecaster_of_ones_own(tmp_path):
+    (tmp_path / "mine.py").write_text(FORECASTER)
+    results = replay_json(
+        SLOW, "--forecaster", "mine:Still", "--sigma-grid", cwd=tmp_path
+    )["traces"][0]["results"]  # fmt: skip
+    own = [result for result in results if result["forecaster"] == "mine:Still"]
+    hold = [result for result in results if result["forecaster"] == "hold"]
+    assert [result["auc"] for result in own] == [result["auc"] for result in hold]
+    error = replay(SLOW, "--forecaster", "mine:broken", cwd=tmp_path, status=2)
+    assert "mine:broken: predicted" in error
+    error = replay(SLOW, "--forecaster", "mine:one_argument", cwd=tmp_path, status=2)
+    assert "mine:one_argument: TypeError: " in error
+    assert "no-such" in replay(SLOW, "--forecaster", "no-such", status=2)
+    assert "ModuleNotFoundError" in replay(SLOW, "--forecaster", "no_such:thing", status=2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["missing.parquet"], "missing.parquet: no such file"),
+        ([__file__], "not a readable Parquet file"),
+        ([SLOW, "--fps", "0"], "above zero"),
+        ([SLOW, "--fps", "thirty"], "exact number"),
+        ([SLOW, "--sigma", "1e-3"], "exact number"),
+        ([SLOW, "--sigma", "0.123456789012"], "too fine"),
+        ([SLOW, "--sigma", "0", "--eta", "0"], "not allowed with"),
+        ([SLOW, "--policy", "newest"], "no policy 'newest'"),
+        ([SLOW, "--policy", "every:0"], "whole number from 1"),
+        ([SLOW, "--latency", "constant:47"], "with its unit"),
+        ([SLOW, "--latency", "resample"], "whole number"),
+        ([SLOW, "--latency-scale", "-2"], "below zero"),
+        ([SLOW, "--convention", "mine"], "no convention 'mine'"),
+        ([SLOW, "--sequence", "no-such"], "no sequence 'no-such'"),
+        ([SLOW, "--timing", "missing.parquet"], "no such file"),
+        ([SLOW, FAST, "--outputs", "out.parquet"], "one trace at a time"),
+        ([SLOW, "--outputs", "out", "--events", "./out"], "or another output"),
+        ([SLOW, "--fps", "15", "30", "--schedule", "s.parquet"], "--schedule takes one frame rate"),
+        ([SLOW, "--latency-scale", "1", "2", "--export-txt", "d"], "--export-txt takes one frame"),
+        ([SLOW, "--schedule", SLOW], "would replace a file that is read"),
+        ([SLOW, "--timing", FAST, "--plot", FAST], "would replace a file that is read"),
+        ([SLOW, "--outputs", os.devnull], "is not a file"),
+        ([SLOW, "--policy", "vot-realtime", "--sigma-grid"], "no permitted latency"),
+        ([SLOW, "--outputs", "no/such/folder/out.parquet"], "cannot write"),
+        ([REAL_TIME, "--latency-scale", "1/2", "--outputs", "o.parquet",
+          "--schedule", "s.parquet", "--events", "e.jsonl", "--export-txt", "d"], "no time for it"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_clear_line_and_leaves_nothing(arguments, words, tmp_path):
+    error = replay(*arguments, cwd=tmp_path, status=2)
+    assert words in error
+    leftovers = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert leftovers == []
+
+
+def written(path, recordings, kind="every-frame", **more):
+    lae_sim.write_trace(lae_sim.Trace(lae_sim.Metadata.new("30", kind, **more), recordings), path)
+    return path
+
+
+def test_no_offline_score_unless_every_sequence_has_every_frame(tmp_path):
+    [one] = lae_sim.read_trace(SLOW, ["boat-calm"])
+    [other] = lae_sim.read_trace(REAL_TIME, ["car-chase"])
+    path = written(tmp_path / "mixed.parquet", [one, other], kind="real-time")
+    report = replay_json(path, "--per-sequence", "--policy", "latest")["traces"][0]
+    assert report["offline"] is None
+    assert "some sequences lack the boxes" in report["notes"][0]
+    kalman = report["results"][1]
+    assert kalman["recovered_auc"] is None
+    assert [s["offline_auc"] is None for s in kalman["per_sequence"]] == [False, True]
+    assert kalman["per_sequence"][0]["recovered_auc"] is not None
+
+
+def test_frames_without_truth_are_counted_and_said(tmp_path):
+    [one, other] = lae_sim.read_trace(SLOW, ["boat-calm", "car-chase"])
+    bare = lae_sim.Recording.new("bare", other.truth * np.nan, other.boxes, other.elapsed_ns)
+    path = written(tmp_path / "bare.parquet", [bare, one])
+    report = replay_json(path)["traces"][0]
+    assert report["frames_without_truth"] == 300
+    assert "1 sequences have none at all, such as 'bare'" in report["notes"][0]
+    assert "missed by AUC and hit by DP" in report["notes"][0]
+    assert "leaves them out" in replay(path, "--convention", "exclude")
+
+
+def test_stalls_of_skipped_frames_are_said(tmp_path):
+    [one] = lae_sim.read_trace(FAST, ["boat-calm"])
+    one.elapsed_ns[1] = 14_000_000_000  # the initialisation takes longer than a frame
+    path = written(tmp_path / "stall.parquet", [one])
+    [note] = replay_json(path)["traces"][0]["notes"]
+    assert note.startswith("1 recorded times above 10 times the median (the longest 14 s)")
+    assert replay_json(path, "--latency", "by-call")["traces"][0]["notes"] == []
+
+
+def test_equal_file_names_and_equal_traces_do_not_collide(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "x.parquet").write_bytes(FAST.read_bytes())
+    both = ("a/x.parquet", "b/x.parquet")
+    options = ("--export-txt", "out", "--sigma", "1/3", "0.333333", "--plot", "p.svg")
+    text = replay(*both, *both, *options, cwd=tmp_path)
+    assert [line.split()[0] for line in text.splitlines()[2:10:4]] == list(both)
+    assert len(list((tmp_path / "out").iterdir())) == 8
+    assert (tmp_path / "out" / "a-x-hold-sigma1_3" / "boat-calm.txt").exists()
+    assert "b/x: kalman" in (tmp_path / "p.svg").read_text()
+
+
+def test_what_a_figure_is_not_is_said(tmp_path):
+    trace = lae_sim.read_trace(SLOW)
+    plain = tmp_path / "plain.parquet"
+    lae_sim.write_trace(
+        lae_sim.Trace(lae_sim.Metadata.new("30", "every-frame"), list(trace)), plain
+    )
+    options = ("--forecaster", "kalman-lae-pvt")
+    assert replay_json(SLOW, *options)["traces"][0]["notes"] == []
+    [note] = replay_json(plain, *options)["traces"][0]["notes"]
+    assert "does not clip forecasts where the image size is unknown" in note
+    assert note in replay(plain, *options)
+
+
+def test_attributes_that_the_trace_does_not_name(tmp_path):
+    trace = lae_sim.read_trace(SLOW)
+    plain = tmp_path / "plain.parquet"
+    lae_sim.write_trace(
+        lae_sim.Trace(lae_sim.Metadata.new("30", "every-frame"), list(trace)), plain
+    )
+    assert "names no attributes" in replay(plain, "--attributes", status=2)
+
+
+def test_both_doors_lead_to_the_same_room():
+    command = [sys.executable, "-m", "lae_sim", "replay", str(FAST)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY, timeout=60)
+    assert done.stdout == replay(FAST, cwd=REPOSITORY)
+    listing = subprocess.run(
+        [sys.executable, "-m", "lae_sim", "--help"], capture_output=True, text=True, cwd=REPOSITORY
+    ).stdout
+    assert "convert" in listing
+    assert "replay" in listing
+    assert "examples:" in replay("--help")
+
+
+def test_a_reader_that_goes_away_is_no_error():
+    script = f"{sys.executable} -m lae_sim.replay {SLOW} --per-sequence | head -1"
+    done = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", script], capture_output=True, text=True, cwd=REPOSITORY
+    )
+    assert (done.returncode, done.stderr) == (0, "")

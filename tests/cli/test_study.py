@@ -1,0 +1,592 @@
+"""Studies as a user runs them: figures, resuming, workers, clusters, and what goes wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from places import REPOSITORY
+
+import lae_sim
+from lae_sim.cli.study import main
+from lae_sim.comparison.forecasters import compare_forecasters
+from lae_sim.errors import LaeError
+from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.learning.trainers import KalmanTrainer
+from lae_sim.replay.latency import bootstrap, scaled
+from lae_sim.study import rows as cell_rows
+from lae_sim.study.run import StudyResults, run_study
+from lae_sim.study.spec import Study
+
+SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
+FAST = REPOSITORY / "traces" / "synthetic-fast.parquet"
+REAL_TIME = REPOSITORY / "traces" / "synthetic-slow-realtime.parquet"
+FEW = ("bike-pan", "car-chase", "person-crowd")
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+
+OWN = """
+import functools
+
+class EveryOther:
+    def __call__(self, clock, calls):
+        last, _, now = calls[-1]
+        frame = last + 2
+        return frame, max(now, frame * clock.frame_ticks)
+
+policy = EveryOther()
+
+class Deadly:
+    def __init__(self, box, image_size=None):
+        import os
+        os.kill(os.getpid(), 9)
+
+class Confused:
+    def __init__(self, box, image_size=None):
+        raise ZeroDivisionError("of my own")
+
+def lazy(box, image_size=None, step=1):
+    return Stay(box)
+
+partial = functools.partial(lazy, step=2)
+
+class Stay:
+    def __init__(self, box, image_size=None):
+        self.box = box
+    def update(self, frame, box):
+        pass
+    def predict(self, frame):
+        return self.box
+"""
+
+
+def run(folder: Path, study: Study | None = None, workers: int = 1, **more: Any) -> StudyResults:
+    study = study or Study((str(SLOW), str(FAST)), sequences=FEW, **more)
+    return run_study(study, folder, workers=workers)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Everything that a study left, by its path; reports of the traces name no worker."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def toml(folder: Path, **keys: Any) -> Path:
+    path = folder / "study.toml"
+    keys = {"traces": [str(SLOW), str(FAST)], "sequences": list(FEW), **keys}
+    path.write_text("\n".join(f"{key} = {json.dumps(value)}" for key, value in keys.items()))
+    return path
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-W", "error", "-m", "lae_sim", "study", *map(str, arguments)]
+
+
+def study_command(*arguments: object, cwd: Path, status: int = 0) -> str:
+    done = subprocess.run(
+        command(*arguments), cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == status, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr if status == 2 else done.stdout
+
+
+# ------------------------------------------------------------------------------ figures
+
+
+def test_every_row_is_what_replaying_and_scoring_one_by_one_gives(tmp_path: Path) -> None:
+    scales, sigmas = (Fraction(1, 2), Fraction(3)), (Fraction(0), Fraction(1, 3))
+    latencies = ("recorded", "bootstrap", "constant:47ms")
+    results = run(
+        tmp_path, scales=scales, sigmas=sigmas, latencies=latencies, repetitions=3, seed=5, block=7
+    )
+    table = results.table().set_index(
+        ["trace", "latency", "scale", "forecaster", "repetition", "sequence", "sigma"]
+    )
+    assert len(table) == 2 * 5 * 2 * 2 * 3 * 2
+    assert table.index.is_unique
+    forecasters = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
+    for label, path in {"synthetic-slow": SLOW, "synthetic-fast": FAST}.items():
+        trace = lae_sim.read_trace(path, FEW)
+        for latency, repetition in [*((name, 0) for name in latencies), ("bootstrap", 2)]:
+            source = {
+                "recorded": lae_sim.by_frame,
+                "bootstrap": bootstrap(5, 7, repetition),
+                "constant:47ms": lae_sim.constant(47_000_000),
+            }[latency]
+            for scale in scales:
+                runs = [*lae_sim.replay_trace(trace, source=scaled(source, scale))]
+                found = lae_sim.evaluate(runs, trace.metadata, forecasters, sigmas)
+                for f, forecaster in enumerate(forecasters):
+                    for s, name in enumerate(FEW):
+                        for m, sigma in enumerate(sigmas):
+                            row = table.loc[
+                                (label, latency, str(scale), forecaster, repetition, name,
+                                 float(sigma))
+                            ]  # fmt: skip
+                            assert row["auc"] == found.scores["auc"][f, s, m]
+                            assert row["norm_auc"] == found.scores["norm_auc"][f, s, m]
+                            assert row["offline_dp20"] == found.offline["dp20"][s]
+                            assert row["processed"] == found.processed[s]
+                            assert row["mismatch_max"] == found.mismatch_max[s, m]
+                            assert row["longest_hold"] == found.longest_hold[s, m]
+                            assert row["failure_frame"] == found.failure[f, s, m]
+                            assert row["approximate_outputs"] == found.departures[s]
+                            assert row["elapsed_ms"] == pytest.approx(
+                                runs[s].schedule.elapsed_ns[1:].mean() / 1e6
+                            )
+
+
+def test_the_summary_has_the_means_of_replay(tmp_path: Path) -> None:
+    results = run(tmp_path, sigmas=SIGMA_GRID)
+    trace = lae_sim.read_trace(SLOW, FEW)
+    found = lae_sim.evaluate(
+        lae_sim.replay_trace(trace),
+        trace.metadata,
+        {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman},
+        SIGMA_GRID,
+    )
+    rows = {(r["trace"], r["forecaster"], r["sigma"]): r for r in results.summary}
+    kalman = rows["synthetic-slow", "kalman", "mean"]
+    assert kalman["auc"] == pytest.approx(found.scores["auc"][1].mean())
+    assert kalman["dp20"] == pytest.approx(found.scores["dp20"][1].mean())
+    hold, offline = found.scores["auc"][0].mean(), found.offline["auc"].mean()
+    assert kalman["recovered_auc"] == pytest.approx((kalman["auc"] - hold) / (offline - hold))
+    assert kalman["auc_low"] < kalman["auc"] < kalman["auc_high"]
+    first = rows["synthetic-slow", "hold", "0"]
+    assert first["auc"] == pytest.approx(found.scores["auc"][0, :, 0].mean())
+    mismatch = found.mismatch_sum[:, 0].sum() / found.frames.sum()
+    assert first["age_ms"] == pytest.approx(1000 / 30 * mismatch)
+    assert first["longest_stale_ms"] == pytest.approx(1000 / 30 * found.longest_hold[:, 0].max())
+    assert first["skip_rate"] == pytest.approx(1 - found.processed.sum() / found.frames.sum())
+    assert "auc_low" not in rows["synthetic-slow", "hold", "1/50"]
+
+
+def test_success_and_precision_curves_are_kept(tmp_path: Path) -> None:
+    results = run(tmp_path)
+    for scores in results.scores:
+        (about,) = scores.about
+        assert np.mean(about["curves"]["success"]) == pytest.approx(scores.means["auc"].mean())
+        assert about["curves"]["precision"][20] == pytest.approx(scores.means["dp20"].mean())
+        offline = scores.once["offline_auc"].mean()
+        assert np.mean(about["curves"]["offline_success"]) == pytest.approx(offline)
+
+
+def test_repetitions_are_dealt_out_in_chunks_that_change_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more: dict[str, Any] = {"latencies": ("bootstrap",), "repetitions": 5}
+    whole = run(tmp_path / "a", **more)
+    monkeypatch.setattr("lae_sim.study.plan.CHUNK_FRAMES", 2 * 2400)
+    parts = run(tmp_path / "b", **more)
+    assert len(parts.plan.cells) == 3 * len(whole.plan.cells)
+    keys = ["trace", "forecaster", "repetition", "sequence"]
+    tables = [r.table().sort_values(keys, ignore_index=True) for r in (whole, parts)]
+    pd.testing.assert_frame_equal(*tables)
+    assert whole.summary == parts.summary
+    assert whole.comparisons == parts.comparisons
+
+
+def test_jitter_has_its_own_interval_and_probability(tmp_path: Path) -> None:
+    results = run(tmp_path, latencies=("recorded", "bootstrap"), repetitions=20)
+    rows = {(row["trace"], row["latency"]): row
+            for row in results.summary if row["forecaster"] == "hold"}  # fmt: skip
+    drawn = rows["synthetic-slow", "bootstrap"]
+    table = results.table().query(
+        "trace == 'synthetic-slow' and latency == 'bootstrap' and forecaster == 'hold'"
+    )
+    means = table.groupby("repetition")["auc"].mean()
+    assert len(means) == drawn["repetitions"] == 20
+    ends = np.quantile(means, [0.025, 0.975])
+    assert [drawn["auc_jitter_low"], drawn["auc_jitter_high"]] == pytest.approx(ends.tolist())
+    assert "auc_jitter_low" not in rows["synthetic-slow", "recorded"]
+    for pair in results.comparisons:
+        a, b = (
+            results.table()
+            .query(f"trace == '{name}' and latency == '{pair['latency']}'")
+            .query(f"forecaster == '{pair['forecaster']}'")
+            .groupby("repetition")["auc"].mean().to_numpy()
+            for name in (pair["a"], pair["b"])
+        )  # fmt: skip
+        wins = (a[:, None] > b).mean() + (a[:, None] == b).mean() / 2
+        assert pair["better_here"] == (None if len(a) == 1 else pytest.approx(wins))
+        assert pair["difference"] == pytest.approx(a.mean() - b.mean())
+
+
+def test_times_of_another_device(tmp_path: Path) -> None:
+    slow = lae_sim.read_trace(SLOW)
+    device = {"model": "other"}
+    document = {**slow.metadata.document, "device": device}
+    recordings = [lae_sim.Recording.new(r.name, r.truth, r.boxes, r.elapsed_ns * 2) for r in slow]
+    other = tmp_path / "other.parquet"
+    lae_sim.write_trace(lae_sim.Trace(lae_sim.Metadata.of(document), recordings), other)
+    results = run(
+        tmp_path / "out",
+        Study((str(SLOW), str(FAST)), timing=(str(other),), sequences=FEW, forecasters=("hold",)),
+    )
+    assert {(row["trace"], row["times_from"]) for row in results.summary} == {
+        ("synthetic-slow", "synthetic-slow"),
+        ("synthetic-slow", "other"),
+        ("synthetic-fast", "synthetic-fast"),
+    }
+    twice = run(tmp_path / "twice", forecasters=("hold",), scales=(Fraction(2),))
+    theirs = next(row["auc"] for row in results.summary if row["times_from"] == "other")
+    assert theirs == next(r["auc"] for r in twice.summary if r["trace"] == "synthetic-slow")
+
+
+def test_what_a_required_auc_asks_for_is_true(tmp_path: Path) -> None:
+    study = Study((str(SLOW),), forecasters=("hold",), require_auc=Fraction(55, 100))
+    (found,) = run(tmp_path, study).required
+    trace = lae_sim.read_trace(SLOW)
+
+    def auc(scale: str) -> float:
+        source = scaled(lae_sim.by_frame, Fraction(scale))
+        runs = lae_sim.replay_trace(trace, source=source)
+        scores = lae_sim.evaluate(runs, trace.metadata, {"hold": lae_sim.Hold}).scores["auc"]
+        return float(scores.mean())
+
+    assert found["auc"] == pytest.approx(auc(found["scale"]))
+    assert found["beyond_auc"] == pytest.approx(auc(found["beyond"]))
+    assert found["beyond_auc"] < 0.55 <= found["auc"]
+    assert Fraction(found["beyond"]) - Fraction(found["scale"]) == Fraction(1, 100)
+    assert found["speed_up"] == pytest.approx(1 / Fraction(found["scale"]))
+    assert found["fps_at_most"] == pytest.approx(30 * Fraction(found["scale"]))
+    paid = replace(study, costs=("hold=1ms",))  # whose time is not one in frames
+    assert run(tmp_path / "paid", paid).required[0]["fps_at_most"] is None
+    study = Study((str(SLOW),), forecasters=("hold",), require_auc=Fraction(9, 10))
+    (never,) = run(tmp_path / "never", study).required
+    assert (never["scale"], never["speed_up"], never["beyond"]) == (None, None, "0")
+    assert never["auc_without_latency"] < 0.9
+
+
+def test_times_that_belong_to_no_trace_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(LaeError, match=r"timing: .*none of the traces is of the same tracker"):
+        run(tmp_path, Study((str(SLOW),), timing=(str(FAST),)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_means_rest_on_is_said(tmp_path: Path) -> None:
+    few = tmp_path / "few.parquet"
+    trace = lae_sim.read_trace(SLOW, FEW[:2])
+    lae_sim.write_trace(trace, few)
+    study = Study((str(FAST), str(few)), sequences=(), costs=("kalman=2ms",))
+    notes = run(tmp_path / "out", study).notes()
+    assert "synthetic: its traces do not have the same sequences: compare no means" in notes
+    assert "few: times: synthetic (made up, not measured)" in notes
+    assert "answers come later by what forecasting costs: kalman 2000 us" in notes
+
+
+# ------------------------------------------------------------------------------ resuming
+
+
+def test_only_what_is_missing_or_changed_is_computed(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.parquet"
+    shutil.copy(SLOW, mine)
+    out = tmp_path / "out"
+    study = Study((str(mine), str(FAST)), sequences=FEW)
+    first = run(out, study)
+    assert (first.computed, len(list((out / "results").iterdir()))) == (4, 4)
+    before = contents(out)
+    assert run(out, study).computed == 0
+    assert contents(out) == before
+
+    next(iter((out / "results").glob("*.parquet"))).unlink()
+    assert run(out, study).computed == 1
+    assert contents(out) == before
+
+    more = Study((str(mine), str(FAST)), sequences=FEW, forecasters=("hold", "constant-velocity"))
+    changed = run(out, more)  # kalman is set aside
+    assert changed.computed == 2
+    assert set(changed.table()["forecaster"]) == {"hold", "constant-velocity"}
+    assert set(pd.read_parquet(out / "results")["forecaster"]) == {"hold", "constant-velocity"}
+    assert run(out, study).computed == 0  # and taken back
+    assert set(pd.read_parquet(out / "results")["forecaster"]) == {"hold", "kalman"}
+
+    shutil.copy(FAST, mine)  # other content under the same name
+    assert run(out, study).computed == 2
+    rows = {(row["trace"], row["forecaster"]): row["auc"] for row in first.summary}
+    again = {(r["trace"], r["forecaster"]): r["auc"] for r in run(out, study).summary}
+    assert again["mine", "hold"] == rows["synthetic-fast", "hold"] != rows["mine", "hold"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "cells", "changed"),
+    [
+        ({"forecasters": ["code_of_study:partial"]}, 2, 1),
+        ({"policies": ["latest", "code_of_study:policy"]}, 4, 2),
+    ],
+)
+def test_the_code_of_a_plug_in_is_an_input(
+    keys: dict[str, Any], cells: int, changed: int, tmp_path: Path
+) -> None:
+    (tmp_path / "code_of_study.py").write_text(OWN)
+    path = toml(tmp_path, traces=[str(FAST)], **keys)
+    for computed in (cells, 0):
+        told = study_command(path, "--no-report", cwd=tmp_path)
+        assert f"{computed} of them computed" in told
+    (tmp_path / "code_of_study.py").write_text(OWN + "# changed\n")
+    assert f"{changed} of them computed" in study_command(path, "--no-report", cwd=tmp_path)
+
+
+def test_what_is_trained_is_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = Study((str(SLOW),), forecasters=("tuned-kalman",))
+    results = run(tmp_path, study)
+    notes = results.notes()
+    assert any("trained in 5 folds over 8 sequences" in note for note in notes)
+    table = compare_forecasters(
+        {"slow": lae_sim.read_trace(SLOW)}, {"tuned-kalman": KalmanTrainer()}
+    )
+    scores = table.query("forecaster == 'tuned-kalman' and metric == 'auc'").set_index("sequence")
+    found = results.table().query("forecaster == 'tuned-kalman'").set_index("sequence")
+    assert found["auc"].to_dict() == scores["value"].to_dict()
+    monkeypatch.setattr("lae_sim.study.plan.fitted", None)
+    again = run(tmp_path, study)
+    assert (again.computed, again.notes()) == (0, notes)
+
+
+def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
+    path = toml(
+        tmp_path, scales=[1, 2, 3, 4, 5, 6, 7, 8], latencies=["recorded", "bootstrap"],
+        repetitions=40,
+    )  # fmt: skip
+    out = tmp_path / "out"
+    asked = command(path, "--out", out, "--workers", 1, "--no-report")
+    with subprocess.Popen(asked, env=ENVIRONMENT, stdout=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 120
+        while len(list(out.glob("results/[!.]*.parquet"))) < 3 and time.monotonic() < deadline:
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+    done = len(list(out.glob("results/[!.]*.parquet")))
+    assert 3 <= done < 64
+    told = study_command(*asked[5:], cwd=tmp_path)
+    assert f"64 cells, {64 - done} of them computed now" in told
+    whole = tmp_path / "whole"
+    study_command(path, "--out", whole, "--workers", 1, "--no-report", cwd=tmp_path)
+    left = {k: v for k, v in contents(out).items() if not Path(k).name.startswith(".")}
+    assert left == contents(whole)
+
+
+# ------------------------------------------------------------------------------ workers
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study with everything in it, computed in this process."""
+    folder = tmp_path_factory.mktemp("alone")
+    run_study(BROAD, folder, workers=1)
+    return folder
+
+
+BROAD = Study(
+    (str(SLOW), str(FAST)),
+    sequences=FEW,
+    latencies=("recorded", "bootstrap", "lognormal"),
+    scales=(Fraction(1), Fraction(2)),
+    repetitions=6,
+    require_auc=Fraction(1, 2),
+)
+
+
+def test_results_are_the_same_bytes_for_any_number_of_workers(alone: Path, tmp_path: Path) -> None:
+    run_study(BROAD, tmp_path, workers=3)
+    assert contents(tmp_path) == contents(alone)
+
+
+@pytest.fixture
+def cluster() -> Iterator[Any]:
+    """A Dask cluster of two worker processes on this machine."""
+    distributed = pytest.importorskip("distributed", reason="the extra distributed is not there")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as found:
+        yield found
+
+
+@pytest.mark.filterwarnings("default")  # Dask's own
+def test_a_cluster_gives_the_same_though_a_worker_is_killed(
+    alone: Path, tmp_path: Path, cluster: Any
+) -> None:
+    killed: list[int] = []
+
+    def progress(what: str, done: int, total: int) -> None:
+        if done == 2 and not killed:
+            worker = next(iter(cluster.workers.values()))
+            killed.append(worker.process.process.pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    results = run_study(BROAD, tmp_path, scheduler=cluster.scheduler_address, progress=progress)
+    assert killed
+    assert not results.failures
+    assert contents(tmp_path) == contents(alone)
+
+
+def test_without_a_scheduler_at_the_address(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="the extra distributed is not there")
+    path = toml(tmp_path)
+    told = study_command(path, "--scheduler", "tcp://127.0.0.1:9", cwd=tmp_path, status=2)
+    assert "no Dask scheduler at tcp://127.0.0.1:9" in told
+
+
+# ------------------------------------------------------------------------------ what goes wrong
+
+
+def test_what_cannot_be_computed_is_told_and_the_rest_is_done(tmp_path: Path) -> None:
+    path = toml(tmp_path, traces=[str(SLOW), str(REAL_TIME)], scales=[1, 2])
+    told = study_command(path, "--no-report", "--json", cwd=tmp_path, status=1)
+    document = json.loads(told)
+    (failure,) = document["failures"]
+    assert "synthetic-slow-realtime" in failure["of"]
+    assert "the tracker skipped it" in failure["reason"]
+    found = {(row["trace"], row["scale"]) for row in document["summary"]}
+    assert ("synthetic-slow-realtime", "1") in found
+    assert ("synthetic-slow-realtime", "2") not in found
+    assert json.loads((tmp_path / "study-results" / "study.json").read_text()) == document
+
+
+def test_an_own_policy_is_replayed_in_simpy_which_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "policy_of_study.py").write_text(OWN)
+    results = run(tmp_path / "out", policies=("latest", "policy_of_study:policy"))
+    engines = {row["policy"]: row["engine"] for row in results.summary}
+    assert engines == {"latest": "batch", "policy_of_study:policy": "simpy"}
+    every = run(tmp_path / "every", policies=("every:2",))
+    own = [row["auc"] for row in results.summary if row["engine"] == "simpy"]
+    assert own == [row["auc"] for row in every.summary]
+
+
+def test_a_worker_that_dies_is_told_in_a_line(tmp_path: Path) -> None:
+    (tmp_path / "deadly_of_study.py").write_text(OWN)
+    path = toml(tmp_path, forecasters=["deadly_of_study:Deadly"], scales=[1, 2])
+    told = study_command(path, "--workers", 2, cwd=tmp_path, status=2)
+    assert "a worker died" in told
+    assert "the same command goes on from there" in told
+    assert told.count("\n") == 1
+
+
+def test_a_forecaster_that_fails_costs_itself_alone(tmp_path: Path) -> None:
+    (tmp_path / "confused_of_study.py").write_text(OWN)
+    path = toml(tmp_path, forecasters=["kalman", "confused_of_study:Confused"])
+    for workers in (1, 2):
+        told = study_command(
+            path, "--no-report", "--json", "--workers", workers, cwd=tmp_path, status=1
+        )
+        document = json.loads(told)
+        assert {row["forecaster"] for row in document["summary"]} == {"hold", "kalman"}
+        assert len(document["failures"]) == 2
+        for failure in document["failures"]:
+            assert "confused_of_study:Confused" in failure["of"]
+            assert "ZeroDivisionError: of my own" in failure["reason"]
+
+
+def test_a_trace_that_changes_meanwhile_is_not_taken_for_what_it_was(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.parquet"
+    shutil.copy(FAST, mine)
+
+    def progress(what: str, done: int, total: int) -> None:
+        if done == 1:
+            shutil.copy(SLOW, mine)
+
+    study = Study((str(mine),), sequences=FEW, scales=(Fraction(1), Fraction(2)))
+    with pytest.raises(LaeError, match="changed since the study began"):
+        run_study(study, tmp_path / "out", workers=1, progress=progress)
+    shutil.copy(FAST, mine)
+    assert run(tmp_path / "out", study).computed == 4
+
+
+def test_files_of_alike_names_keep_apart(tmp_path: Path) -> None:
+    shutil.copy(SLOW, tmp_path / "a")
+    shutil.copy(FAST, tmp_path / "a.parquet")
+    study = Study((str(tmp_path / "a"), str(tmp_path / "a.parquet")), sequences=FEW)
+    rows = run(tmp_path / "out", study).summary
+    assert len({row["auc"] for row in rows}) == len(rows) == 4
+
+
+def test_a_folder_has_one_study_at_a_time(tmp_path: Path) -> None:
+    from lae_sim.study.store import Store
+
+    with Store(tmp_path).locked(), pytest.raises(LaeError, match="another study is writing there"):
+        run(tmp_path)
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "mine.parquet").write_text("mine")
+    with pytest.raises(LaeError, match="not of a study"):
+        run(tmp_path)
+    assert (tmp_path / "results" / "mine.parquet").read_text() == "mine"
+
+
+def test_a_tracker_slower_than_its_sequences_has_no_time_of_a_call(tmp_path: Path) -> None:
+    results = run(tmp_path, latencies=("constant:100s",), forecasters=("hold",))
+    assert {row["elapsed_ms"] for row in results.summary} == {None}
+    assert not any(row["pareto"] for row in results.summary)
+    lae_sim.write_report(results, tmp_path / "report.html")
+    lae_sim.write_tables(results, tmp_path / "tables")
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"forecasters": ["kalmann"]}, "no forecaster 'kalmann'"),
+        ({"traces": ["nothing/*.parquet"]}, "nothing/*.parquet: no trace is there"),
+        ({"sequences": ["none"]}, "no sequence 'none'"),
+        ({"scale": 2}, "unknown key 'scale': did you mean 'scales'?"),
+        ({"costs": ["imm=2ms"]}, "there is no forecaster 'imm' here"),
+    ],
+)
+def test_bad_studies_are_one_line_and_leave_nothing(
+    keys: dict[str, Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = toml(tmp_path, **keys)
+    assert main([str(path), "--out", str(tmp_path / "out"), "--workers", "1"]) == 2
+    told = capsys.readouterr()
+    assert said in told.err
+    assert told.err.count("\n") == 1
+    assert not list((tmp_path / "out").glob("*.csv"))
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(LaeError, match="not of a study"):
+        run(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_damaged_notes_of_a_cell_say_what_to_do(tmp_path: Path) -> None:
+    run(tmp_path)
+    for path in (tmp_path / "about").glob("*.json"):
+        path.write_text("{")
+    with pytest.raises(LaeError, match="delete it"):
+        run(tmp_path)
+
+
+def test_a_damaged_cell_says_what_to_do(tmp_path: Path) -> None:
+    run(tmp_path)
+    path = next(iter((tmp_path / "results").glob("*.parquet")))
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(LaeError, match=f"{path.name}: damaged: delete it"):
+        run(tmp_path)
+    path.unlink()
+    assert run(tmp_path).computed == 1
+
+
+def test_the_columns_are_those_that_are_documented(tmp_path: Path) -> None:
+    table = run(tmp_path).table()
+    assert list(table) == list(cell_rows.COLUMNS)

@@ -1,0 +1,244 @@
+"""Comparing forecasters: every value of the tidy table is what ``evaluate`` gives directly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from places import TRACES
+
+from lae_sim.comparison.forecasters import compare_forecasters, steps
+from lae_sim.comparison.statistics import summarise
+from lae_sim.engine.policies import fifo
+from lae_sim.errors import LaeError
+from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.metrics import METRICS, find_convention
+from lae_sim.forecast.base import ConstantVelocity, Hold, Oracle
+from lae_sim.forecast.kalman import Kalman
+from lae_sim.learning.folds import Examples, assign_folds
+from lae_sim.learning.registry import load_any
+from lae_sim.learning.trainers import KalmanTrainer
+from lae_sim.replay.latency import by_frame, constant, scaled
+from lae_sim.replay.run import replay_trace
+from lae_sim.replay.world import World
+from lae_sim.trace.file import Trace, read_trace
+from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.recording import Recording
+
+SEQUENCES = ["bike-pan", "car-chase", "person-crowd"]
+FORECASTERS = {"kalman": Kalman, "velocity": ConstantVelocity}
+KEYS = ["trace", "dataset", "sequence", "latency", "scale", "forecaster", "sigma", "metric"]
+
+
+@pytest.fixture(scope="module")
+def slow() -> Trace:
+    return read_trace(TRACES / "synthetic-slow.parquet", SEQUENCES)
+
+
+@pytest.fixture(scope="module")
+def fast() -> Trace:
+    return read_trace(TRACES / "synthetic-fast.parquet", SEQUENCES)
+
+
+def values(table: pd.DataFrame, **wanted: Any) -> np.ndarray:
+    """The values of some rows in order."""
+    for key, value in wanted.items():
+        table = table[table[key] == value]
+    return table["value"].to_numpy()
+
+
+def test_columns_and_rows(slow: Trace) -> None:
+    table = compare_forecasters({"slow": slow}, FORECASTERS)
+    assert list(table) == [*KEYS, "value"]
+    assert not table.duplicated(KEYS).any()
+    assert len(table) == 4 * 4 * 3  # metrics, forecasters with hold and offline, sequences
+    assert list(table["forecaster"].unique()) == ["hold", "kalman", "velocity", "offline"]
+    assert list(table["sequence"].unique()) == SEQUENCES
+    assert set(table["dataset"]) == {"synthetic"}
+    assert set(table["metric"]) == set(METRICS)
+    assert list(table.index) == list(range(len(table)))
+    assert [str(kind) for kind in table[["scale", "sigma", "value"]].dtypes] == ["float64"] * 3
+
+
+def test_every_value_is_what_evaluate_gives(slow: Trace, fast: Trace) -> None:
+    sources = {"recorded": by_frame, "constant:90ms": constant(90_000_000)}
+    scales, sigmas = [Fraction(1, 2), Fraction(2)], [Fraction(0), Fraction(1, 3), Fraction(1)]
+    fps, convention = Fraction(25), find_convention("otb")
+    world = World(sources, scales, fps, fifo)
+    traces = {"slow": slow, "fast": fast}
+    table = compare_forecasters(traces, FORECASTERS, world, sigmas, convention)
+    keys = ["trace", "latency", "scale", "metric", "forecaster", "sigma"]
+    got = table.groupby(keys)["value"].agg(list).to_dict()
+    expected = {}
+    ready = {"hold": Hold, **FORECASTERS}
+    for label, trace in traces.items():
+        for latency, source in sources.items():
+            for scale in scales:
+                runs = replay_trace(trace, fps, scaled(source, scale), fifo)
+                found = evaluate(runs, trace.metadata, ready, sigmas, convention)
+                for m in METRICS:
+                    here = label, latency, float(scale), m
+                    for k, sigma in enumerate(map(float, sigmas)):
+                        expected[(*here, "offline", sigma)] = found.offline[m].tolist()
+                        for f, name in enumerate(ready):
+                            expected[(*here, name, sigma)] = found.scores[m][f, :, k].tolist()
+    assert got == expected
+
+
+def test_the_order_of_the_traces_does_not_change_a_value(slow: Trace, fast: Trace) -> None:
+    trainer = KalmanTrainer(q=(0.3, 3.0), decay=(0.95, 1.0), state=("corner",))
+    forecasters = {**FORECASTERS, "tuned": trainer}
+    one = compare_forecasters({"slow": slow, "fast": fast}, forecasters, folds=3)
+    other = compare_forecasters({"fast": fast, "slow": slow}, forecasters, folds=3)
+    assert one["trace"].iloc[0] == "slow" != other["trace"].iloc[0]
+    one, other = (table.sort_values(KEYS, ignore_index=True) for table in (one, other))
+    pd.testing.assert_frame_equal(one, other, check_exact=True)
+
+
+class Spy:
+    """A trainer that remembers what it was shown; what it makes answers with the oldest box."""
+
+    def __init__(self) -> None:
+        self.shown: list[set[str]] = []
+        self.seeds: list[int] = []
+
+    def fit(self, examples: Examples, seed: int) -> Any:
+        seen = examples.lanes.lane(examples.item)
+        self.shown.append({examples.sequences[lane] for lane in seen})
+        self.seeds.append(seed)
+        return Hold
+
+
+def test_nothing_is_trained_on_what_it_is_scored_on(slow: Trace, fast: Trace) -> None:
+    spy = Spy()
+    told: list[str] = []
+    world = World({"recorded": by_frame}, [Fraction(1), Fraction(2)])
+    arguments = ({"slow": slow, "fast": fast}, {"spy": spy, **FORECASTERS}, world)
+    table = compare_forecasters(*arguments, folds=3, seed=7, progress=told.append)
+    folds = assign_folds(SEQUENCES, 3, 7)
+    everything = set(SEQUENCES)
+    assert spy.shown == [
+        everything - {name for name in SEQUENCES if folds[name] == k} for k in (0, 1, 2)
+    ]
+    assert spy.seeds == [7] * 3
+    assert told[:3] == ["training spy"] * 3
+    assert told[3:] == ["slow, recorded", "slow, recorded x 2", "fast, recorded"] + told[-1:]
+    assert len(told) == steps(*arguments, folds=3)
+    np.testing.assert_array_equal(values(table, forecaster="spy"), values(table, forecaster="hold"))
+    [note] = [note for note in table.attrs["notes"] if note.startswith("spy")]
+    assert "trained in 3 folds over 3 sequences" in note
+    assert "seed 7" in note
+
+
+def test_notes_say_what_is_approximate(slow: Trace) -> None:
+    world = World({"constant:1ms": constant(1_000_000), "constant:90ms": constant(90_000_000)})
+    notes = compare_forecasters({"slow": slow}, {}, world).attrs["notes"]
+    assert notes == [
+        "slow, constant:90ms: approximate, 100% of the outputs follow another frame than when "
+        "recorded"
+    ]
+
+
+def test_a_real_time_trace_is_exact_and_has_no_offline_scores() -> None:
+    trace = read_trace(TRACES / "synthetic-slow-realtime.parquet", SEQUENCES)
+    table = compare_forecasters({"run": trace}, FORECASTERS)
+    assert np.isnan(values(table, forecaster="offline")).all()
+    assert np.isfinite(table["value"][table["forecaster"] != "offline"]).all()
+    assert not [note for note in table.attrs["notes"] if "approximate" in note]
+    every_frame = read_trace(TRACES / "synthetic-slow.parquet", SEQUENCES)
+    again = compare_forecasters({"run": every_frame}, FORECASTERS)
+    known = table["forecaster"] != "offline"
+    pd.testing.assert_frame_equal(table[known], again[known], check_exact=True)
+    with pytest.raises(LaeError, match="the trace has no box for it"):
+        compare_forecasters(
+            {"run": trace}, FORECASTERS, World({"constant:1ms": constant(1_000_000)})
+        )
+
+
+def test_costs_delay_the_answers(slow: Trace) -> None:
+    free = compare_forecasters({"slow": slow}, FORECASTERS)
+    table = compare_forecasters({"slow": slow}, FORECASTERS, costs=["kalman=40ms"])
+    costs = {"kalman": 40_000_000}
+    runs = list(replay_trace(slow))
+    found = evaluate(runs, slow.metadata, {"kalman": Kalman}, costs=costs)
+    got = values(table, forecaster="kalman", metric="auc")
+    np.testing.assert_array_equal(got, found.scores["auc"][0, :, 0])
+    assert got.mean() < values(free, forecaster="kalman", metric="auc").mean()
+    for name in ("hold", "velocity", "offline"):
+        got, expected = values(table, forecaster=name), values(free, forecaster=name)
+        np.testing.assert_array_equal(got, expected)
+    assert [note for note in table.attrs["notes"] if "kalman 40000 us" in note]
+    with pytest.raises(LaeError, match="no forecaster 'nobody'"):
+        compare_forecasters({"slow": slow}, FORECASTERS, costs=["nobody=1ms"])
+
+
+def test_forecasters_that_must_know_their_sequence(slow: Trace) -> None:
+    table = compare_forecasters({"slow": slow}, {"oracle": Oracle})
+    got = values(table, forecaster="oracle", metric="auc")
+    np.testing.assert_allclose(got, 20 / 21, rtol=0, atol=1e-12)
+
+
+def test_what_cannot_be_compared(slow: Trace) -> None:
+    with pytest.raises(LaeError, match="nothing to compare"):
+        compare_forecasters({}, FORECASTERS)
+    with pytest.raises(LaeError, match="offline is the name of the tracker's own scores"):
+        compare_forecasters({"slow": slow}, {"offline": Kalman})
+    alone = read_trace(TRACES / "synthetic-slow.parquet", SEQUENCES[:1])
+    with pytest.raises(LaeError, match="only one video"):
+        compare_forecasters({"slow": alone}, {"tuned-kalman": load_any("tuned-kalman")})
+
+
+def test_a_sequence_without_truth_has_no_value_where_the_convention_leaves_it_out() -> None:
+    boxes = np.tile([10.0, 10, 20, 20], (9, 1))
+    truth = np.full((9, 4), np.nan)
+    recordings = [
+        Recording.new("bare", truth, boxes, np.full(9, 10**7)),
+        Recording.new("good", boxes, boxes, np.full(9, 10**7)),
+    ]
+    trace = Trace(Metadata.new("30", "every-frame"), recordings)
+    table = compare_forecasters({"a": trace}, FORECASTERS, convention=find_convention("exclude"))
+    assert np.isnan(values(table, sequence="bare")).all()
+    assert np.isfinite(values(table, sequence="good")).all()
+    assert [note for note in table.attrs["notes"] if "no ground truth" in note]
+    assert set(summarise(table, resamples=10)["sequences"]) == {1}
+
+
+LATENCIES = {f"constant:{ms}ms": constant(ms * 1_000_000) for ms in (20, 47, 68, 167)}
+
+
+@pytest.mark.parametrize(
+    ("name", "shares", "exact"),
+    [
+        ("kalman", [49.9, 52.0, 48.6, 28.3], True),
+        ("least-squares", [69, 56, 50, 28], False),
+    ],
+)
+def test_nanotrack_on_dtb70(
+    shared_data: Path, name: str, shares: Sequence[float], exact: bool
+) -> None:
+    """Issue 4's figures of the paper's filter, and what least squares must reach."""
+
+    def recordings() -> Any:
+        with np.load(shared_data / "results_boxes" / "DTB70" / "NanoTrackV3.npz") as boxes:
+            for sequence in sorted(boxes.files):
+                path = shared_data / "DTB70" / "anno" / f"{sequence}.txt"
+                truth = np.loadtxt(path, delimiter=",")
+                times = np.full(len(truth), 47_000_000)
+                yield Recording.new(sequence, truth, boxes[sequence], times)
+
+    trace = Trace(Metadata.new("30", "every-frame"), list(recordings()))
+    table = compare_forecasters({"nano": trace}, {name: load_any(name)}, World(LATENCIES))
+    summary = summarise(table, metrics=["auc"], resamples=10)
+    ours = summary[summary["forecaster"] == name]
+    assert list(ours["latency"]) == list(LATENCIES)
+    assert set(ours["sequences"]) == {70}
+    found = 100 * ours["recovered"].to_numpy()
+    if exact:
+        np.testing.assert_allclose(found, shares, rtol=0, atol=0.1)
+    else:
+        assert (found >= shares).all(), found

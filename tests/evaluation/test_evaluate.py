@@ -1,0 +1,310 @@
+"""Evaluation of groups of sequences over many sigmas, against the witnesses."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from witness import (
+    SIGMAS,
+    DenseKalman,
+    DenseLaePvt,
+    event_driven,
+    follow,
+    moving,
+    psi,
+    schedule_latest,
+    scores,
+    worlds,
+)
+
+from lae_sim.boxes import iou
+from lae_sim.engine.clock import Clock
+from lae_sim.engine.policies import vot_realtime
+from lae_sim.errors import LaeError
+from lae_sim.evaluation.evaluate import Evaluation, answers, evaluate
+from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, precision_curve, success_curve
+from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.forecast.base import ConstantVelocity, Hold
+from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
+from lae_sim.replay.latency import constant
+from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.recording import Recording
+
+CLOCK = Clock.at(Fraction(30))
+EVERY = Metadata.new("30", "every-frame")
+FORECASTERS = {
+    "hold": Hold,
+    "velocity": ConstantVelocity,
+    "kalman": Kalman,
+    "kalman-lae-pvt": KalmanLaePvt,
+}
+
+
+@st.composite
+def groups(draw: st.DrawFn) -> tuple[Fraction, list[Recording]]:
+    """Some sequences of one frame rate, with truth near the boxes, and some of it missing."""
+    fps, elapsed, boxes = draw(worlds(20))
+    shift = st.integers(-24, 24).map(lambda v: v / 4)
+    group = [(elapsed, boxes)]
+    for _ in range(draw(st.integers(0, 2))):
+        _, elapsed, boxes = draw(worlds(12))
+        group.append((elapsed, boxes))
+    recordings = []
+    for s, (elapsed, boxes) in enumerate(group):
+        truth = np.array(boxes)
+        truth[:, :2] += draw(shift)
+        for i in draw(st.sets(st.integers(0, len(boxes) - 1), max_size=4)):
+            truth[i] = draw(st.sampled_from([math.nan, 0.0]))
+        recordings.append(Recording.new(f"s{s}", truth, boxes, elapsed))
+    return fps, recordings
+
+
+def plain_truth(recording: Recording) -> list[list[float] | None]:
+    return [None if math.isnan(row[0]) else row for row in recording.truth.tolist()]
+
+
+@given(groups(), SIGMAS, st.sampled_from(list(CONVENTIONS)))
+@settings(max_examples=45)
+def test_scores_agree_with_plain_loops_over_the_oracle(
+    group: tuple[Fraction, list[Recording]], sigmas: list[Fraction], name: str
+) -> None:
+    fps, recordings = group
+    clock = Clock.at(fps)
+    runs = [replay_sequence(recording, clock) for recording in recordings]
+    found = evaluate(runs, EVERY, FORECASTERS, sigmas, CONVENTIONS[name])
+    chosen = sorted({0, len(sigmas) // 2, len(sigmas) - 1})
+    for s, (recording, run) in enumerate(zip(recordings, runs)):
+        truth = plain_truth(recording)
+        done = schedule_latest(fps, recording.elapsed_ns.tolist())
+        for m in chosen:
+            psis = psi(done, fps, len(recording), sigmas[m])
+            for f, (forecaster, factory) in enumerate(FORECASTERS.items()):
+                told = answers(run, EVERY, forecaster, factory, sigmas[m])
+                assert told.source_frame.tolist() == psis
+                if forecaster == "hold":
+                    assert told.boxes.tolist() == recording.boxes[psis].tolist()
+                    expected = scores(truth, told.boxes.tolist(), name)
+                else:
+                    expected = scores(truth, told.boxes.tolist(), name, float)
+                for metric, value in expected.items():
+                    value = math.nan if value is None else float(value)
+                    score = found.scores[metric][f, s, m]
+                    assert score == pytest.approx(value, abs=1e-12, nan_ok=True)
+
+
+@given(groups(), SIGMAS, st.sampled_from(list(CONVENTIONS)))
+@settings(max_examples=20)
+def test_curves_and_failures_agree_with_those_of_single_sequences(
+    group: tuple[Fraction, list[Recording]], sigmas: list[Fraction], name: str
+) -> None:
+    fps, recordings = group
+    convention = CONVENTIONS[name]
+    runs = [replay_sequence(recording, Clock.at(fps)) for recording in recordings]
+    found = evaluate(runs, EVERY, FORECASTERS, sigmas, convention)
+    for s, run in enumerate(runs):
+        truth = run.recording.truth
+        valid = convention.valid_success(truth)
+        for f, (forecaster, factory) in enumerate(FORECASTERS.items()):
+            for m, sigma in enumerate(sigmas):
+                boxes = answers(run, EVERY, forecaster, factory, sigma).boxes
+                if convention.first_frame_is_truth:
+                    boxes[0] = truth[0]
+                overlaps = (iou(truth[i : i + 1], boxes[i : i + 1])[0] for i in range(len(run)))
+                apart = [i for i, overlap in enumerate(overlaps) if valid[i] and overlap == 0]
+                assert found.failure[f, s, m] == min(apart, default=len(run))
+            boxes = answers(run, EVERY, forecaster, factory, sigmas[0]).boxes
+            for curves, curve, metric in (
+                (found.success, success_curve, "auc"),
+                (found.precision, precision_curve, "dp20"),
+            ):
+                if math.isnan(found.scores[metric][f, s, 0]):
+                    assert np.isnan(curves[f, s]).all()
+                else:
+                    np.testing.assert_array_equal(curves[f, s], curve(truth, boxes, convention))
+
+
+@given(groups(), SIGMAS)
+@settings(max_examples=40)
+def test_kalman_answers_agree_with_dense_matrices(
+    group: tuple[Fraction, list[Recording]], sigmas: list[Fraction]
+) -> None:
+    fps, recordings = group
+    for recording in recordings:
+        run = replay_sequence(recording, Clock.at(fps))
+        done = schedule_latest(fps, recording.elapsed_ns.tolist())
+        for sigma in sigmas[:3]:
+            psis = psi(done, fps, len(recording), sigma)
+            told = answers(run, EVERY, "kalman", Kalman, sigma)
+            expected = follow(psis, recording.boxes, DenseKalman)
+            np.testing.assert_allclose(told.boxes, expected, rtol=0, atol=1e-7)
+
+
+@given(groups(), SIGMAS)
+@settings(max_examples=30)
+def test_evaluation_agrees_with_the_event_driven_world(
+    group: tuple[Fraction, list[Recording]], sigmas: list[Fraction]
+) -> None:
+    fps, recordings = group
+    runs = [replay_sequence(recording, Clock.at(fps)) for recording in recordings]
+    found = evaluate(runs, EVERY, {"kalman": Kalman}, sigmas)
+    for s, recording in enumerate(recordings):
+        processed, tellings = event_driven(
+            fps, recording.elapsed_ns.tolist(), recording.boxes.tolist(), sigmas
+        )
+        assert found.processed[s] == len(processed)
+        lags = [[i - source for i, source in enumerate(told.psi)] for told in tellings]
+        assert found.mismatch_sum[s].tolist() == [sum(lag) for lag in lags]
+        assert found.mismatch_max[s].tolist() == [max(lag) for lag in lags]
+
+
+@given(groups(), st.booleans())
+@settings(max_examples=25)
+def test_the_grid_is_its_sigmas_one_by_one_and_groups_are_their_sequences(
+    group: tuple[Fraction, list[Recording]], at_arrival: bool
+) -> None:
+    fps, recordings = group
+    runs = [replay_sequence(recording, Clock.at(fps)) for recording in recordings]
+    sigmas = [Fraction(-1, 2), *SIGMA_GRID[::5], Fraction(4, 3)]
+    together = evaluate(runs, EVERY, FORECASTERS, sigmas, at_arrival=at_arrival)
+    for s, run in enumerate(runs):
+        for m, sigma in enumerate(sigmas):
+            alone = evaluate([run], EVERY, FORECASTERS, [sigma], at_arrival=at_arrival)
+            for metric in METRICS:
+                np.testing.assert_array_equal(
+                    together.scores[metric][:, s, m], alone.scores[metric][:, 0, 0]
+                )
+            assert together.mismatch_sum[s, m] == alone.mismatch_sum[0, 0]
+            assert together.longest_hold[s, m] == alone.longest_hold[0, 0]
+
+
+def test_streaming_and_lane_forecasters_score_the_same() -> None:
+    runs = [replay_sequence(moving(60, seed, f"s{seed}"), CLOCK) for seed in range(4)]
+    lanes = evaluate(runs, EVERY, FORECASTERS, SIGMA_GRID)
+    streaming = {
+        name: lambda box, size, factory=factory: factory(box, size)
+        for name, factory in FORECASTERS.items()
+    }
+    found = evaluate(runs, EVERY, streaming, SIGMA_GRID)
+    for metric in METRICS:
+        assert found.scores[metric].tobytes() == lanes.scores[metric].tobytes()
+
+
+def test_kalman_lae_pvt_agrees_with_matrices_through_answers() -> None:
+    from collections import Counter
+
+    DenseLaePvt.hits = Counter()
+    size = (260, 190)
+    metadata = Metadata.new("30", "every-frame", sequences={"a": {"image_size": list(size)}})
+    for seed in range(6):
+        recording = moving(150, seed)
+        run = replay_sequence(recording, CLOCK, constant(90_000_000))
+        for sigma in (Fraction(0), Fraction(1, 2), Fraction(-1)):
+            told = answers(run, metadata, "kalman-lae-pvt", KalmanLaePvt, sigma)
+            expected = follow(
+                told.source_frame.tolist(),
+                recording.boxes,
+                lambda box: DenseLaePvt(box, size),
+            )
+            np.testing.assert_allclose(told.boxes, expected, rtol=0, atol=1e-7)
+    assert DenseLaePvt.hits["clipped"] > 100
+    assert DenseLaePvt.hits["update"] > 100
+
+
+def test_the_initial_box_answers_until_the_first_output_is_fed() -> None:
+    # DESIGN 4: while psi(i) = 0 the answer is the initial box, even where it leaves the image
+    boxes = np.tile([-10.3, 20.1, 40.7, 30.9], (9, 1))
+    recording = Recording.new("a", boxes, boxes, [10**9] * 9)
+    metadata = Metadata.new("30", "every-frame", sequences={"a": {"image_size": [640, 360]}})
+    run = replay_sequence(recording, CLOCK)
+    for name in ("hold", "velocity", "kalman"):
+        told = answers(run, metadata, name, FORECASTERS[name])
+        assert told.boxes.tolist() == boxes.tolist()
+
+
+# ----------------------------------------------------------------------------- what else it says
+
+
+def test_counts_by_hand() -> None:
+    # 25 frames/s; 0 is ready at 100 ms, then frame 2 at 140, 3 at 160, and 4 starts at 160
+    times = [100_000_000, 1, 40_000_000, 20_000_000, 0]
+    recording = Recording.new("a", np.ones((5, 4)), np.ones((5, 4)), times)
+    run = replay_sequence(recording, Clock.at(Fraction(25)))
+    assert run.schedule.frames.tolist() == [0, 2, 3, 4]
+    found = evaluate([run], EVERY, {"hold": Hold}, [Fraction(0), Fraction(1, 2)])
+    assert found.sequences == ("a",)
+    assert found.frames.tolist() == [5]
+    assert found.processed.tolist() == [4]
+    assert found.departures.tolist() == [1]
+    assert found.init_ns.tolist() == [100_000_000]
+    assert found.calls_ns.tolist() == [60_000_000]
+    assert found.calls_hz.tolist() == [np.inf]  # a call took 0 ns
+    # sigma 0: psi = 0 0 0 0 4; sigma 1/2: queries at 20, 60, 100, 140, 180: psi = 0 0 0 2 4
+    assert found.mismatch_sum.tolist() == [[6, 4]]
+    assert found.mismatch_max.tolist() == [[3, 2]]
+    assert found.longest_hold.tolist() == [[4, 3]]
+
+
+def test_offline_scores_need_every_frame() -> None:
+    full = moving(40)
+    run = replay_sequence(full, CLOCK)
+    sparse = Recording.of_run("b", run.schedule, run.boxes, full.truth)
+    found = evaluate([run, replay_sequence(sparse, CLOCK)], EVERY, {"hold": Hold})
+    for metric in METRICS:
+        assert np.isnan(found.offline[metric]).tolist() == [False, True]
+        assert found.scores[metric][0, 0, 0] == found.scores[metric][0, 1, 0]
+
+
+def test_joined_is_the_evaluation_of_all() -> None:
+    runs = [replay_sequence(moving(20 + seed, seed, f"s{seed}"), CLOCK) for seed in range(5)]
+
+    def of(some: list[Run]) -> Evaluation:
+        return evaluate(some, EVERY, FORECASTERS, SIGMA_GRID)
+
+    whole = of(runs)
+    joined = Evaluation.joined([of(runs[a:b]) for a, b in pairwise([0, 2, 3, 5])])
+    assert joined.sequences == whole.sequences
+    for field in ("frames", "processed", "departures", "init_ns", "calls_ns", "calls_hz"):
+        assert getattr(joined, field).tolist() == getattr(whole, field).tolist()
+    for field in ("mismatch_sum", "mismatch_max", "longest_hold"):
+        assert getattr(joined, field).tolist() == getattr(whole, field).tolist()
+    for metric in METRICS:
+        assert joined.scores[metric].tobytes() == whole.scores[metric].tobytes()
+        assert joined.offline[metric].tobytes() == whole.offline[metric].tobytes()
+
+
+def test_vot_scores_each_output_at_its_own_frame() -> None:
+    recording = moving(50, elapsed=10_000_000)
+    run = replay_sequence(recording, CLOCK, policy=vot_realtime())
+    found = evaluate([run], EVERY, {"hold": Hold}, at_arrival=True)
+    for metric in METRICS:
+        assert found.scores[metric].item() == found.offline[metric].item()
+    assert found.mismatch_sum.item() == 0
+
+
+def test_a_forecaster_that_answers_nonsense_is_named() -> None:
+    class Nonsense(ConstantVelocity):
+        def predict(self, frame: int) -> list[float]:
+            return [math.nan] * 4
+
+    def factory(box: list[float], size: object) -> Nonsense:
+        return Nonsense(box)
+
+    with pytest.raises(LaeError, match="mine: predicted"):
+        evaluate([replay_sequence(moving(9), CLOCK)], EVERY, {"mine": factory})
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-9, 1e9])
+def test_tiny_and_huge_boxes_are_scored_without_a_warning(size: float) -> None:
+    boxes = moving(30).boxes * size
+    recording = Recording.new("a", boxes, boxes[::-1], [40_000_000] * 30)
+    metadata = Metadata.new("30", "every-frame", sequences={"a": {"image_size": [640, 360]}})
+    found = evaluate([replay_sequence(recording, CLOCK)], metadata, FORECASTERS, SIGMA_GRID)
+    for metric in METRICS:
+        assert ((found.scores[metric] >= 0) & (found.scores[metric] <= 1)).all()

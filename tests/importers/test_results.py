@@ -1,0 +1,330 @@
+import contextlib
+import io
+import struct
+import zipfile
+import zlib
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lae_sim.errors import LaeError
+from lae_sim.importers.results import find_results, given_times, read_mat, read_results
+
+BOXES = np.array([[1, 2, 3, 4], [5, 6, 7.5, 8]])
+TEXT = {"got10k": "1,2,3,4\n5,6,7.5,8\n", "pytracking": "1\t2\t3\t4\n5\t6\t7.5\t8\n"}
+TIMES = "0.1\n0.026255\n"
+
+
+def write(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def read(root, **settings):
+    settings = {"wanted": "auto", "repetition": 1, "unit": None, "measured": True, **settings}
+    kind, sources = find_results(root, settings["wanted"], settings["repetition"])
+    arguments = (settings["repetition"], settings["unit"], settings["measured"])
+    return kind, {s.name: read_results(kind, s, *arguments) for s in sources}
+
+
+@pytest.mark.parametrize("kind", TEXT)
+@pytest.mark.parametrize("times", ["{}_time.txt", "times/{}_time.txt"])
+def test_text_with_times(tmp_path, kind, times):
+    for name in ("b", "a"):
+        write(tmp_path / f"{name}.txt", TEXT[kind])
+        write(tmp_path / times.format(name), TIMES)
+    write(tmp_path / "a_all_boxes.txt", "1 2 3\n")
+    found, results = read(tmp_path)
+    assert found == kind
+    assert list(results) == ["a", "b"]
+    np.testing.assert_array_equal(results["a"].boxes, BOXES)
+    assert results["a"].elapsed_ns.tolist() == [100_000_000, 26_255_000]
+    assert read(tmp_path, measured=False)[1]["a"].elapsed_ns is None
+    assert read(tmp_path, wanted="ope")[1]["a"].elapsed_ns is None
+
+
+def test_got10k_folders_and_repetitions(tmp_path):
+    for run in (1, 2):
+        write(tmp_path / "seq" / f"seq_00{run}.txt", f"{run},2,3,4\n5,6,7,8\n")
+    write(tmp_path / "seq" / "seq_time.txt", "0.1,0.3\n0.2,0.4\n")
+    for run, times in ((1, [0.1, 0.2]), (2, [0.3, 0.4])):
+        kind, results = read(tmp_path, repetition=run)
+        assert kind == "got10k"
+        assert results["seq"].boxes[0, 0] == run
+        assert results["seq"].elapsed_ns.tolist() == [round(time * 1e9) for time in times]
+    with pytest.raises(LaeError, match="no results found"):
+        read(tmp_path, repetition=3)
+
+
+def test_one_file(tmp_path):
+    write(tmp_path / "a.txt", TEXT["got10k"])
+    write(tmp_path / "b.txt", TEXT["got10k"])
+    write(tmp_path / "times" / "a_time.txt", TIMES)
+    kind, results = read(tmp_path / "a.txt")
+    assert (kind, list(results)) == ("got10k", ["a"])
+    assert len(results["a"].elapsed_ns) == 2
+
+
+@pytest.mark.parametrize("separator", [",", "\t", " "])
+def test_ope(tmp_path, separator):
+    write(tmp_path / "a.txt", TEXT["got10k"].replace(",", separator))
+    kind, results = read(tmp_path)
+    assert (kind, results["a"].elapsed_ns) == ("ope", None)
+    np.testing.assert_array_equal(results["a"].boxes, BOXES)
+
+
+def test_npz(tmp_path):
+    np.savez(tmp_path / "KCF.npz", b=BOXES.astype(np.float32), a=BOXES)
+    kind, results = read(tmp_path / "KCF.npz")
+    assert (kind, list(results)) == ("npz", ["a", "b"])
+    assert results["b"].boxes.dtype == np.float64
+    np.testing.assert_array_equal(results["b"].boxes, BOXES)
+
+
+@pytest.mark.parametrize(
+    ("array", "problem"),
+    [
+        (np.zeros(4), "must be a table of numbers"),
+        (np.zeros((2, 5)), "5 columns; boxes have 4"),
+        (np.array([["1", "2", "3", "4"]]), "must be a table of numbers"),
+        (np.array([[1, 2, 3, 4], [1, 2, np.nan, 4]]), "row 2 is not finite"),
+        (np.array([[None] * 4]), "cannot be read"),
+    ],
+)
+def test_npz_faults(tmp_path, array, problem):
+    np.savez(tmp_path / "KCF.npz", a=array)
+    with pytest.raises(LaeError, match=problem):
+        read(tmp_path / "KCF.npz")
+
+
+def test_npz_bombs_and_damage(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(b"PK no zip")
+    with pytest.raises(LaeError, match=r"not a readable \.npz"):
+        read(path)
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 34, 4)}
+    )
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", header.getvalue())
+    with pytest.raises(LaeError, match="cannot be read"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"res": BOXES, "fps": 20.5},
+        {"results": {"res": BOXES, "fps": 20.5, "type": "rect", "len": 2, "annoBegin": 1}},
+        {"results": np.array([{"res": BOXES, "fps": 20.5, "type": "rect"}], dtype=object)},
+    ],
+)
+@pytest.mark.parametrize("compressed", [False, True])
+def test_mat(tmp_path, content, compressed):
+    path = tmp_path / "Basketball_KCF.mat"
+    scipy.io.savemat(path, content, do_compression=compressed)
+    results = read_mat(path)
+    np.testing.assert_array_equal(results.boxes, BOXES)
+    assert results.mean_fps == Fraction(41, 2)
+    kind, found = read(tmp_path)
+    assert (kind, list(found)) == ("mat", ["Basketball_KCF"])
+
+
+@pytest.mark.parametrize("fps", [np.nan, 0, -1, "fast", np.array([1.0, 2])])
+def test_mat_without_a_rate(tmp_path, fps):
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"res": BOXES, "fps": fps})
+    assert read_mat(path).mean_fps is None
+    scipy.io.savemat(path, {"res": BOXES[:1]})
+    assert read_mat(path).boxes.tolist() == [[1, 2, 3, 4]]
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        ({"boxes": BOXES}, "no field 'res'"),
+        ({"results": 3.0}, "no field 'res'"),
+        ({"res": BOXES[:, :3]}, "3 columns"),
+        ({"res": BOXES * 1j}, "table of numbers"),
+        ({"res": "text"}, "table of numbers"),
+        ({"res": np.array([[1, 2, 3, np.nan]])}, "row 1 is not finite"),
+        ({"results": {"res": BOXES, "len": 3}}, "field 'len' is 3, and 'res' has 2 rows"),
+        ({"results": {"res": BOXES, "type": "ivtAff"}}, "type 'ivtAff'"),
+        ({"results": np.array([{"res": BOXES}] * 3, dtype=object)}, "holds 3 runs"),
+        ({"results": np.empty((0, 0))}, "no field 'res'"),
+    ],
+)
+def test_mat_faults(tmp_path, content, problem):
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, content)
+    with pytest.raises(LaeError, match=problem):
+        read_mat(path)
+
+
+def test_mat_7_3_says_what_to_do(tmp_path):
+    path = tmp_path / "a.mat"
+    for head in (b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512), b"\x89HDF\r\n\x1a\n"):
+        path.write_bytes(head)
+        with pytest.raises(LaeError, match=r"save\(\.\.\., '-v7'\)"):
+            read_mat(path)
+
+
+def test_damaged_mat(tmp_path):
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"results": {"res": BOXES, "fps": 20.5, "type": "rect"}})
+    data = path.read_bytes()
+    for end in range(0, len(data), 16):
+        path.write_bytes(data[:end])
+        with pytest.raises(LaeError):
+            read_mat(path)
+
+
+HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x100) + b"IM"
+
+
+def element(kind, data):
+    return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+
+def packed(data):
+    return struct.pack("<II", 15, len(data)) + data
+
+
+def nested(levels):
+    """Cells in cells; loadmat of SciPy overflows the C stack at some 10,000."""
+    head = element(6, struct.pack("<II", 1, 0)) + element(5, struct.pack("<ii", 1, 1))
+    head += element(1, b"")
+    data = struct.pack("<II", 14, 0)
+    for _ in range(levels):
+        data = struct.pack("<II", 14, len(head) + len(data)) + head + data
+    return data
+
+
+@pytest.mark.parametrize("pack", [bytes, lambda data: packed(zlib.compress(data))])
+def test_nested_mat(tmp_path, pack):
+    path = tmp_path / "a.mat"
+    path.write_bytes(HEADER + pack(nested(3)))
+    with pytest.raises(LaeError, match="no field 'res'"):
+        read_mat(path)
+    path.write_bytes(HEADER + pack(nested(2000)))
+    with pytest.raises(LaeError, match="nested too deeply"):
+        read_mat(path)
+
+
+def test_mat_bomb(tmp_path):
+    path = tmp_path / "a.mat"
+    packer = zlib.compressobj(9)
+    bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(140)) + packer.flush()
+    path.write_bytes(HEADER + packed(bomb))
+    with pytest.raises(LaeError, match="too large"):
+        read_mat(path)
+
+
+@given(st.data())
+def test_changed_mat_bytes_are_values_or_errors(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "changed.mat"
+    run = {"res": BOXES, "fps": 20.5, "type": "rect", "tracker": ["a", 1]}
+    scipy.io.savemat(path, {"results": np.array([run], dtype=object)})
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    with contextlib.suppress(LaeError):
+        read_mat(path)
+
+
+def big_endian_mat():
+    """A struct as a big-endian machine writes it, with small elements and packed numbers."""
+
+    def tagged(kind, data):
+        if len(data) <= 4:
+            return struct.pack(">I", len(data) << 16 | kind) + data.ljust(4, b"\0")
+        return struct.pack(">II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+    def matrix(kind, shape, name, *parts):
+        flags, sizes = struct.pack(">II", kind, 0), struct.pack(">ii", *shape)
+        return tagged(14, tagged(6, flags) + tagged(5, sizes) + tagged(1, name) + b"".join(parts))
+
+    res = matrix(6, (1, 4), b"", tagged(2, bytes([1, 2, 3, 4])))
+    fps = matrix(6, (1, 1), b"", tagged(3, struct.pack(">h", 300)))
+    names = tagged(5, struct.pack(">i", 4)) + tagged(1, b"res\0fps\0")
+    header = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(">H", 0x100) + b"MI"
+    return header + matrix(2, (1, 1), b"results", names, res, fps)
+
+
+def test_big_endian_mat(tmp_path):
+    path = tmp_path / "a.mat"
+    path.write_bytes(big_endian_mat())
+    expected = scipy.io.loadmat(path, simplify_cells=True)["results"]
+    results = read_mat(path)
+    assert results.boxes.tolist() == [expected["res"].tolist()] == [[1, 2, 3, 4]]
+    assert results.mean_fps == expected["fps"] == 300
+
+
+def test_nothing_and_too_much(tmp_path):
+    with pytest.raises(LaeError, match="no such file or folder"):
+        find_results(tmp_path / "none")
+    with pytest.raises(LaeError, match="no results found; looked for"):
+        find_results(tmp_path)
+    write(tmp_path / "a.txt", TEXT["got10k"])
+    scipy.io.savemat(tmp_path / "a.mat", {"res": BOXES})
+    with pytest.raises(LaeError, match="holds mat and text results"):
+        find_results(tmp_path)
+    assert find_results(tmp_path, "mat")[0] == "mat"
+    with pytest.raises(LaeError, match="of format lae-pvt"):
+        find_results(tmp_path, "lae-pvt")
+
+
+@pytest.mark.parametrize(
+    ("text", "source", "ns"),
+    [
+        ("constant:47ms", "constant 47 ms, not measured", 47_000_000),
+        ("constant:0.1s", "constant 0.1 s, not measured", 100_000_000),
+        ("mean-fps:120.3", "mean fps 120.3 given, not measured per frame", 8_312_552),
+        ("mean-fps:30000/1001", "mean fps 30000/1001 given, not measured per frame", 33_366_667),
+        ("mean-fps:3", "mean fps 3 given, not measured per frame", 333_333_333),
+    ],
+)
+def test_given_times(text, source, ns):
+    given = given_times(text, "any")
+    assert (given.source, given.of("a", 3)) == (source, ns)
+
+
+def test_measured_times_are_not_given():
+    assert given_times("measured", "any") is None
+    for text in ("constant:47", "constant:", "mean-fps:0", "mean-fps:", "fast", "measured:1"):
+        with pytest.raises(LaeError):
+            given_times(text, "any")
+
+
+def test_mean_fps_file(tmp_path):
+    path = tmp_path / "fps.csv"
+    write(path, "tracker,sequence,frames,fps\nKCF,a,2,300\nKCF,b,,0.7441\nECO,a,2,30\n")
+    given = given_times(f"mean-fps:{path}", "KCF")
+    assert given.source == "mean fps of each sequence from fps.csv, not measured per frame"
+    assert given.of("a", 2) == 3_333_333
+    assert given.of("b", 99) == round(Fraction(10**13, 7441))
+    with pytest.raises(LaeError, match="'a' has 2 frames there and 3 here"):
+        given.of("a", 3)
+    with pytest.raises(LaeError, match="no row for sequence 'c'"):
+        given.of("c", 3)
+    with pytest.raises(
+        LaeError, match="has ECO, KCF, not 'SRDCF'; if it is there under another name"
+    ):
+        given_times(f"mean-fps:{path}", "SRDCF")
+    write(path, "sequence,fps\na,25\n")
+    assert given_times(f"mean-fps:{path}", "any").of("a", 7) == 40_000_000
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a,b\n1,2\n", "sequence,fps\na,fast\n", "sequence,fps\na\n", "sequence,fps\na,0\n"]
+)
+def test_damaged_mean_fps_file(tmp_path, text):
+    write(tmp_path / "fps.csv", text)
+    with pytest.raises(LaeError, match=r"fps\.csv"):
+        given_times(f"mean-fps:{tmp_path / 'fps.csv'}", "any")

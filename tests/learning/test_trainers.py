@@ -1,0 +1,165 @@
+"""Training: the network learns and is repeatable; the tuned Kalman filter finds known numbers."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from witness import moving
+
+from lae_sim.boxes import iou
+from lae_sim.engine.clock import Clock
+from lae_sim.errors import LaeError
+from lae_sim.forecast.base import Hold, forecast
+from lae_sim.forecast.kalman import PAPER, TunedKalman
+from lae_sim.forecast.learned import Learned, new_network
+from lae_sim.forecast.window import Windowed
+from lae_sim.learning.folds import Examples, Trainer
+from lae_sim.learning.trainers import KalmanTrainer, NetworkTrainer
+from lae_sim.replay.latency import constant
+from lae_sim.replay.run import replay_sequence
+from lae_sim.trace.recording import Recording
+
+
+def examples_of(recordings: list[Recording], elapsed_ns: int = 90_000_000) -> Examples:
+    clock, source = Clock.at(Fraction(30)), constant(elapsed_ns)
+    return Examples.of([replay_sequence(recording, clock, source) for recording in recordings])
+
+
+def score(factory: Any, examples: Examples) -> float:
+    """Mean IoU with the truth, every sequence the same."""
+    valid = examples.truth[:, 2] > 0
+    boxes = forecast(factory, examples.lanes, examples.item[valid], examples.frame[valid])
+    ious = iou(examples.truth[valid], boxes)
+    lanes = examples.lanes.lane(examples.item[valid])
+    return float(np.mean([ious[lanes == lane].mean() for lane in np.unique(lanes)]))
+
+
+def straight(seed: int, noise: float = 1.5, length: int = 90) -> Recording:
+    """Constant velocity, measured with noise."""
+    random = np.random.default_rng(seed)
+    velocity = [*random.uniform(-6, 6, 2), 0, 0]
+    truth = np.array([300, 200, 44, 32]) + np.arange(length)[:, None] * velocity
+    boxes = truth + random.normal(0, noise, truth.shape)
+    return Recording.new(f"s{seed:02}", truth, boxes, [1] * length)
+
+
+# ------------------------------------------------------------------------------------- the network
+
+
+def test_a_network_learns_to_average_noise_away(torch: Any) -> None:
+    trained = NetworkTrainer(steps=60, batch=256).fit(examples_of([straight(k) for k in range(12)]))
+    torch.manual_seed(0)
+    untrained = Windowed(Learned(new_network(), {"sequences": []}))
+    others = examples_of([straight(k) for k in range(50, 58)])
+    hold, start, end = (score(factory, others) for factory in (Hold, untrained, trained))
+    assert hold + 0.1 < start < end - 0.01
+    assert end > 0.8
+
+
+def weights(trained: Any) -> bytes:
+    parameters = trained.rule.network.state_dict().values()
+    return b"".join(value.numpy().tobytes() for value in parameters)
+
+
+def test_the_same_seed_trains_the_same_network_whatever_was_done_before(torch: Any) -> None:
+    examples = examples_of([moving(50, 1, "a"), moving(40, 2, "b")])
+    told: list[int] = []
+    first = NetworkTrainer(4, 32, progress=told.append).fit(examples, 5)
+    assert told == [1] * 4
+    state = torch.random.get_rng_state()
+    torch.rand(7)
+    assert weights(NetworkTrainer(4, 32).fit(examples, 5)) == weights(first)
+    assert weights(NetworkTrainer(4, 32).fit(examples, 6)) != weights(first)
+    torch.random.set_rng_state(state)
+    before = torch.rand(3)
+    torch.random.set_rng_state(state)
+    NetworkTrainer(2, 8).fit(examples, 5)
+    assert torch.equal(torch.rand(3), before)  # nor does it disturb what others draw
+    assert first.rule.document == {"sequences": ["a", "b"], "seed": 5, "steps": 4}
+    assert isinstance(NetworkTrainer(), Trainer)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 9, 10, 11, 20])
+def test_any_number_of_steps(torch: Any, steps: int) -> None:
+    assert weights(NetworkTrainer(steps, 4).fit(examples_of([moving(12)])))
+
+
+def test_only_what_is_asked_is_learnt_and_named(torch: Any) -> None:
+    """A network trained without a sequence is the same whatever that sequence's answers are."""
+    parts = [moving(40, 1, "a"), moving(40, 2, "b")]
+    other = Recording.new("b", parts[1].truth + 99, parts[1].boxes, parts[1].elapsed_ns)
+    trained = [
+        NetworkTrainer(3, 32).fit(examples_of([parts[0], b]).without("b"))
+        for b in (parts[1], other)
+    ]
+    assert weights(trained[0]) == weights(trained[1])
+    assert trained[0].rule.trained_on == ["a"]
+
+
+def test_missing_truth_and_missing_boxes_do_no_harm(torch: Any) -> None:
+    whole = moving(60, 3)
+    truth = whole.truth.copy()
+    truth[::3], truth[1] = np.nan, [5, 5, 0, 0]
+    frames = replay_sequence(whole, Clock.at(Fraction(30)), constant(90_000_000)).schedule.frames
+    boxes, elapsed = np.full((60, 4), np.nan), np.full(60, -1)
+    boxes[frames], elapsed[frames] = whole.boxes[frames], 1
+    for recording in (
+        Recording.new("a", truth, boxes, elapsed),
+        Recording.new("a", np.full((60, 4), np.nan), whole.boxes, whole.elapsed_ns),
+    ):
+        trained = NetworkTrainer(5, 32).fit(examples_of([recording]))
+        assert np.isfinite(np.frombuffer(weights(trained), np.float32)).all()
+
+
+def test_nothing_to_learn_from(torch: Any) -> None:
+    examples = examples_of([moving(9, 0, "a")])
+    blind = Recording.new("a", np.full((9, 4), np.nan), np.full((9, 4), 5.0) * 0, [1] * 9)
+    for nothing in (examples.without("a"), examples_of([blind])):
+        with pytest.raises(LaeError, match="nothing to learn from"):
+            NetworkTrainer().fit(nothing)
+
+
+# ---------------------------------------------------------------------------- the Kalman filter
+
+
+def simulated(q: float, decay: float, seed: int, length: int = 240) -> Recording:
+    """Motion as the filter's model has it, frame by frame, on a target so large as to be seen."""
+    random = np.random.default_rng(seed)
+    position, velocity, path = np.zeros(2), random.normal(0, 10, 2), []
+    for _ in range(length):
+        path.append(position)
+        position = position + velocity + random.normal(0, np.sqrt(q), 2)
+        velocity = decay * velocity + random.normal(0, np.sqrt(q), 2)
+    truth = np.column_stack([path, np.full((length, 2), 200 + 40 * np.sqrt(q))])
+    boxes = truth + random.normal(0, np.sqrt(10), truth.shape) * [1, 1, 0, 0]
+    return Recording.new(f"s{seed}", truth, boxes, [1] * length)
+
+
+@pytest.mark.parametrize("q", [0.03, 1.0, 30.0])
+def test_the_noise_that_data_have_is_found(q: float) -> None:
+    examples = examples_of([simulated(q, 1.0, seed) for seed in range(5)], 30_000_000)
+    found = KalmanTrainer(state=("corner",)).fit(examples)
+    assert q / 4 < found.q < 4 * q  # the candidates stand three apart
+    assert found.decay >= 0.98
+
+
+def test_a_velocity_that_dies_is_found() -> None:
+    examples = examples_of([simulated(30.0, 0.8, seed) for seed in range(5)])
+    assert KalmanTrainer().fit(examples).decay <= 0.9
+
+
+def test_no_other_value_of_one_parameter_is_better() -> None:
+    trainer = KalmanTrainer(q=(0.1, 1.0, 10.0), decay=(0.9, 1.0))
+    examples = examples_of([moving(60, 1, "a"), moving(200, 2, "b")])
+    found = trainer.fit(examples, seed=1)
+    assert found == trainer.fit(examples, seed=2)
+    best = score(found, examples)
+    assert best >= score(PAPER, examples)
+    for q in trainer.q:
+        assert score(TunedKalman(q, decay=found.decay, state=found.state), examples) <= best + 1e-12
+    for decay in trainer.decay:
+        assert score(TunedKalman(found.q, decay=decay, state=found.state), examples) <= best + 1e-12
+    assert isinstance(trainer, Trainer)

@@ -1,0 +1,134 @@
+"""The passes of a profile: what is run, warmed up, kept and merged."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fakes import FakeTimed, bright_sequence
+
+from lae_sim.datasets.frames import Dataset, ImageSequence
+from lae_sim.errors import LaeError
+from lae_sim.profile.journal import Journal
+from lae_sim.profile.live import LiveRun, run_every_frame
+from lae_sim.profile.passes import Pass, parse_timing, run_pass, write_pass
+from lae_sim.trace.file import Trace, read_trace, write_trace
+from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.recording import Recording
+
+PATH = [(5.0 + 2 * i, 8.0) for i in range(6)]
+
+
+def metadata(time: str) -> Metadata:
+    device = {"readings": {"before": {"time": time}}}
+    timing = {"clock": "made up", "source": "measured"}
+    return Metadata.new("30", "every-frame", device=device, timing=timing)
+
+
+def a_pass(tmp_path: Path, tracker: FakeTimed, time: str = "1") -> Pass:
+    def run(sequence: ImageSequence, **more: Any) -> LiveRun:
+        return run_every_frame(sequence, tracker, **more)
+
+    return Pass("first", tmp_path / "t.parquet", metadata(time), run)
+
+
+def ran(task: Pass, tracker: FakeTimed, journal: Journal, names: str, warmup: int = 0) -> list[Any]:
+    dataset = Dataset("d", Fraction(30), [sequence(name) for name in names])
+    return run_pass(task, dataset, tracker, journal, warmup, lambda frames: None)
+
+
+def sequence(name: str) -> ImageSequence:
+    """A good sequence, but for "x", whose first frame cannot be read."""
+
+    def unreadable(frame: int) -> Any:
+        raise LaeError("cannot be read")
+
+    good = bright_sequence(PATH, name)
+    return ImageSequence(name, good.truth, unreadable) if name == "x" else good
+
+
+def test_the_warm_up_is_made_up_for_after_a_bad_first_sequence(tmp_path: Path) -> None:
+    tracker = FakeTimed()
+    journal = Journal(tmp_path / "t.unfinished", {}, resume=False)
+    failures = ran(a_pass(tmp_path, tracker), tracker, journal, "xyz", warmup=3)
+    assert [failure["sequence"] for failure in failures] == ["x"]
+    assert len(tracker.frames) == 3 + 2 * 5
+
+
+def test_a_failing_warm_up_names_the_sequence(tmp_path: Path) -> None:
+    tracker = FakeTimed()
+    odd = ImageSequence("odd", bright_sequence(PATH).truth, lambda frame: np.zeros((9, 9)))
+    journal = Journal(tmp_path / "t.unfinished", {}, resume=False)
+    dataset = Dataset("d", Fraction(30), [odd])
+    (failure,) = run_pass(a_pass(tmp_path, tracker), dataset, tracker, journal, 2, print)
+    assert "sequence 'odd', frame 0: a frame must be uint8" in failure["reason"]
+
+
+def test_a_resumed_pass_is_one_trace_of_both_runs(tmp_path: Path) -> None:
+    folder, tracker = tmp_path / "t.unfinished", FakeTimed()
+    ran(a_pass(tmp_path, tracker, "1"), tracker, Journal(folder, {}, resume=False), "ac")
+    task, journal = a_pass(tmp_path, tracker, "2"), Journal(folder, {}, resume=True)
+    ran(task, tracker, journal, "abc")
+    write_pass(task, journal, [])
+    trace = read_trace(task.path)
+    assert [recording.name for recording in trace] == ["a", "b", "c"]
+    document = trace.metadata.document
+    assert document["sequences"]["b"]["order"] == 1
+    assert document["device"]["readings"]["before"] == {"time": "1"}
+
+
+def test_a_damaged_part_is_run_again(tmp_path: Path) -> None:
+    folder, tracker = tmp_path / "t.unfinished", FakeTimed()
+    task = a_pass(tmp_path, tracker)
+    ran(task, tracker, Journal(folder, {}, resume=False), "ab")
+    part = folder / "first" / "b.parquet"
+    part.write_bytes(part.read_bytes()[:300])
+    journal = Journal(folder, {}, resume=True)
+    assert journal.finished("first") == ["a"]
+    ran(task, tracker, journal, "ab")
+    write_pass(task, journal, [])
+    assert [recording.name for recording in read_trace(task.path)] == ["a", "b"]
+
+
+@pytest.mark.parametrize("text", ["[1]", "{", None])
+def test_a_journal_without_its_settings(tmp_path: Path, text: str | None) -> None:
+    folder = tmp_path / "t.unfinished"
+    Journal(folder, {"a": 1}, resume=False)
+    if text is None:
+        (folder / "settings.json").unlink()
+    else:
+        (folder / "settings.json").write_text(text)
+    with pytest.raises(LaeError, match="remove it to start anew"):
+        Journal(folder, {"a": 1}, resume=True)
+
+
+def test_a_journal_keeps_any_name(tmp_path: Path) -> None:
+    names = sorted(["a.b", ".c", "..", "d/e", "100%", "-f", "ü ñ", "g\nh"])
+    journal = Journal(tmp_path / "t.unfinished", {}, resume=False)
+    for name in names:
+        recording = Recording.new(name, [[1, 1, 1, 1]], [[1, 1, 1, 1]], [1])
+        journal.add("first", recording, metadata(json.dumps(name)))
+    assert journal.finished("first") == names
+    assert [recording.name for recording in journal.recordings("first")] == names
+
+
+def test_times_of_another_device(tmp_path: Path) -> None:
+    box = [[1.0, 1, 9, 9]] * 6
+    path = tmp_path / "times.parquet"
+    described = {"device": {"model": "D"}, "timing": {"clock": "made up"}}
+    recordings = [Recording.new("a", box, box, [7, 8, 9, 10, 11, 12])]
+    write_trace(Trace(Metadata.new("30", "every-frame", **described), recordings), path)
+    source, timing = parse_timing(str(path))
+    assert source == "times.parquet (D), not measured here"
+    assert [timing(sequence("a"))(frame) for frame in range(6)] == [7, 8, 9, 10, 11, 12]
+    with pytest.raises(LaeError, match="no times of sequence 'b'"):
+        timing(sequence("b"))
+    with pytest.raises(LaeError, match="has 6 frames of sequence 'a', which has 4 here"):
+        timing(bright_sequence(PATH[:4], "a"))
+    source, timing = parse_timing("constant:47ms")
+    assert source == "constant 47ms, not measured"
+    assert timing(sequence("b"))(3) == 47_000_000

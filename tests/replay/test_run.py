@@ -1,0 +1,135 @@
+"""Replays in batches and in repetitions: field for field those made one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from witness import moving
+
+from lae_sim.engine import lanes as batch
+from lae_sim.engine.clock import Clock
+from lae_sim.engine.policies import every, latest, vot_realtime
+from lae_sim.engine.scheduler import Call, Policy
+from lae_sim.errors import LaeError
+from lae_sim.replay import run
+from lae_sim.replay.latency import (
+    LatencySource,
+    bootstrap,
+    by_call,
+    by_frame,
+    constant,
+    lognormal,
+    resampled,
+    scaled,
+)
+from lae_sim.replay.run import Run, replay_repeated, replay_trace
+from lae_sim.trace.file import Trace
+from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.recording import Recording
+
+NAMES = [f"s{i:02}" for i in range(12)]
+EVERY = Metadata.new("30", "every-frame")
+TRACE = Trace(EVERY, [moving(20 + 7 * i, i, name) for i, name in enumerate(NAMES)])
+SLOWER = Trace(EVERY, [moving(len(r), 99, r.name, 120_000_000) for r in TRACE])
+
+
+def fields(run: Run) -> list[object]:
+    """All of a run, to the byte."""
+    schedule = run.schedule
+    arrays = (schedule.frames, schedule.start, schedule.ready, run.boxes)
+    return [
+        run.recording.name,
+        schedule.clock,
+        schedule.length,
+        *((array.dtype, array.shape, array.tobytes()) for array in arrays),
+        run.departures,
+        repr(run.disagreement),
+    ]
+
+
+@pytest.fixture(params=["one group", "small groups"])
+def groups(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if request.param == "small groups":
+        monkeypatch.setattr(batch, "_CELLS", 500)
+        monkeypatch.setattr(run, "_GROUP_FRAMES", 300)
+        monkeypatch.setattr(run, "_LANE_FRAMES", 800)
+
+
+def backwards_at_40(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+    last, _, now = calls[-1]
+    return (last + 1 if last < 40 else 0), max(now, (last + 1) * clock.frame_ticks)
+
+
+@pytest.mark.usefixtures("groups")
+@pytest.mark.parametrize("policy", [latest, every(2), vot_realtime()])
+@pytest.mark.parametrize(
+    "source", [by_frame, by_call, constant(47_000_000), scaled(bootstrap(3), Fraction(2))]
+)
+def test_a_batch_gives_the_same_runs(source: LatencySource, policy: Policy) -> None:
+    half = Trace(replace(EVERY, document={**EVERY.document, "schedule": {
+        "kind": "every-frame", "stride": "2"}}), SLOWER.recordings)  # fmt: skip
+    assert half.metadata.stride == 2
+    for options in ({}, {"timing": SLOWER}, {"strided": [half]}, {"fps": Fraction(30000, 1001)}):
+        alone = replay_trace(TRACE, source=source, policy=policy, **options)  # type: ignore[arg-type]
+        together = replay_trace(TRACE, source=source, policy=policy, batch=True, **options)  # type: ignore[arg-type]
+        assert [fields(r) for r in together] == [fields(r) for r in alone]
+
+
+@pytest.mark.usefixtures("groups")
+def test_a_batch_fails_where_its_runs_do() -> None:
+    for policy, timing in ((backwards_at_40, None), (latest, gappy())):
+        outcomes = []
+        for together in (False, True):
+            names: list[str] = []
+            runs = replay_trace(TRACE, policy=policy, timing=timing, batch=together)
+            with pytest.raises(LaeError) as error:
+                names.extend(found.recording.name for found in runs)
+            outcomes.append((names, str(error.value)))
+        assert outcomes[0] == outcomes[1]
+        assert outcomes[0][0]
+
+
+def gappy() -> Trace:
+    recordings = list(TRACE)
+    ns = np.where(np.arange(len(recordings[5])) == 3, -1, 1)
+    recordings[5] = Recording.new("s05", recordings[5].truth, recordings[5].boxes, ns)
+    return Trace(EVERY, recordings)
+
+
+@pytest.mark.usefixtures("groups")
+@pytest.mark.parametrize("make", [bootstrap, resampled, lognormal])
+@pytest.mark.parametrize("policy", [latest, vot_realtime()])
+@pytest.mark.parametrize("timing", [None, SLOWER])
+def test_repetitions_are_replays(make, policy: Policy, timing: Trace | None) -> None:  # type: ignore[no-untyped-def]
+    found = {}
+    for repetition, replayed in replay_repeated(
+        TRACE, make(7), 3, policy=policy, timing=timing, first=2
+    ):
+        found[repetition, replayed.recording.name] = fields(replayed)
+    expected = {
+        (repetition, replayed.recording.name): fields(replayed)
+        for repetition in (2, 3, 4)
+        for replayed in replay_trace(
+            TRACE, source=make(7, repetition=repetition), policy=policy, timing=timing
+        )
+    }
+    assert found == expected
+
+
+@pytest.mark.usefixtures("groups")
+def test_repetitions_do_not_depend_on_other_sequences() -> None:
+    alone = Trace(EVERY, [moving(20 + 7 * 4, 4, "s04")])
+    among = [
+        fields(r) for _, r in replay_repeated(TRACE, bootstrap(7), 5) if r.recording.name == "s04"
+    ]
+    assert among == [fields(r) for _, r in replay_repeated(alone, bootstrap(7), 5)]
+
+
+def test_repetitions_come_one_after_another() -> None:
+    found = [(k, r.recording.name) for k, r in replay_repeated(TRACE, bootstrap(7), 2)]
+    assert found == [(k, name) for k in range(2) for name in NAMES]
+    assert list(replay_repeated(TRACE, bootstrap(7), 0)) == []

@@ -1,0 +1,135 @@
+"""Tables of studies: figures of the summary, and LaTeX and CSV that hold whatever names hold."""
+
+from __future__ import annotations
+
+import csv
+from fractions import Fraction
+
+import pytest
+from nasty import nasty_traces
+
+from lae_sim.report.study_tables import (
+    comparison_table,
+    ranking,
+    required_table,
+    table2,
+    write_tables,
+)
+from lae_sim.report.study_view import View
+from lae_sim.report.table import Entry, Table, latex, tex
+from lae_sim.study.run import StudyResults, run_study
+from lae_sim.study.spec import Study
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> StudyResults:
+    folder = tmp_path_factory.mktemp("nasty")
+    study = Study(
+        tuple(nasty_traces(folder)),
+        scales=(Fraction(1, 2), Fraction(1), Fraction(2)),
+        require_auc=Fraction(1, 2),
+    )
+    return run_study(study, folder / "results", workers=1)
+
+
+def test_ranking_says_what_the_summary_says(results):
+    table = ranking(View(results))
+    assert table.header[:4] == ("tracker", "forecaster", "dataset", "scale")
+    found = {}
+    for row in table.rows:
+        entries = dict(zip(table.header, row))
+        key = (
+            entries["scale"].text,
+            entries["tracker"].text[-4:].strip(),
+            entries["forecaster"].text,
+        )
+        found[key] = entries
+    assert len(found) == len(results.summary) == 12
+    for row in results.summary:
+        ours = found[row["scale"], row["trace"], row["forecaster"]]
+        assert ours["AUC"].value == row["auc"]
+        assert ours["AUC"].ends == (row["auc_low"], row["auc_high"])
+        assert ours["change"].value == pytest.approx(row["auc"] / row["offline_auc"] - 1)
+        assert ours["age ms"].value == row["age_ms"]
+        assert ours["front"].value == row["pareto"]
+        assert (ours["replay"].text == "exact") == row["exact"]
+    aucs = [row[table.header.index("AUC")].value for row in table.rows[:4]]
+    assert aucs == sorted(aucs, reverse=True)
+
+
+def test_table2_shows_scale_1_and_changes(results):
+    table = table2(View(results))
+    summary = {(r["trace"], r["forecaster"]): r for r in results.summary if r["scale"] == "1"}
+    assert [row[1].text for row in table.rows] == ["offline", "hold", "kalman"] * 2
+    for row in table.rows:
+        hold = summary[row[0].text[-4:].strip(), "hold"]
+        if row[1].text == "kalman":
+            kalman = summary[row[0].text[-4:].strip(), "kalman"]
+            assert row[2].value == kalman["auc"]
+            assert row[3].value == pytest.approx(kalman["auc"] / hold["auc"] - 1)
+        elif row[1].text == "hold":
+            assert row[5].value == pytest.approx(hold["dp20"] / hold["offline_dp20"] - 1)
+    online = [row for row in table.rows if row[1].text != "offline"]
+    best = max(online, key=lambda row: row[2].value)
+    assert best[2].rank == 1
+    assert all(row[2].rank == 0 for row in table.rows if row[1].text == "offline")
+
+
+def test_pairs_and_requirements(results):
+    view = View(results)
+    [*names, _, p, holm, _, _] = comparison_table(view).header
+    assert names == ["scale", "forecaster", "a", "b", "n"]
+    assert (p, holm) == ("p", "p (Holm)")
+    rows = required_table(view).rows
+    assert [row[0].value for row in rows] == ["one", "one", "two", "two"]
+    assert [row[2].value for row in rows] == [0.5] * 4
+
+
+def test_files(results, tmp_path):
+    write_tables(results, tmp_path / "new" / "tables")
+    names = {"ranking", "table2", "attributes", "comparisons", "required"}
+    files = {path.name for path in (tmp_path / "new" / "tables").iterdir()}
+    assert files == {f"{name}.{kind}" for name in names for kind in ("csv", "tex")}
+    with open(tmp_path / "new" / "tables" / "ranking.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["tracker"].count("<script>") for row in rows} == {1}
+    assert float(rows[0]["AUC low"]) <= float(rows[0]["AUC"]) <= float(rows[0]["AUC high"])
+    text = (tmp_path / "new" / "tables" / "ranking.tex").read_text()
+    body = [line for line in text.splitlines() if not line.startswith("%")]
+    assert all(line.count(r"\&") == 2 for line in body if "script" in line)
+    assert len([line for line in body if line.endswith(r" \\")]) == 1 + 4  # scale 1 alone
+
+
+def test_golden_latex():
+    rows = (
+        (Entry("A_1", "A_1"), Entry("hold", "hold"), Entry("0.512", 0.512, rank=2)),
+        (Entry("A_1", "A_1"), Entry("kalman", "kalman"), Entry("-0.6%", -0.6, rank=1)),
+        (Entry("B", "B"), Entry("hold", "hold"), Entry("-", None)),
+    )
+    table = Table("t", "What 50% is", ("tracker", "f", "Δ"), rows, 2, (("D&D", 1),))
+    assert latex(table) == "\n".join([
+        "% What 50% is",
+        r"% \usepackage{booktabs}; if it is too wide: \usepackage{adjustbox} and",
+        r"% \adjustbox{max width=\linewidth}{\input{t}}",
+        r"\begin{tabular}{@{}llr@{}}",
+        r"\toprule",
+        r" &  & \multicolumn{1}{c}{D\&D} \\",
+        r"\cmidrule(lr){3-3}",
+        r"tracker & f & $\Delta$ \\",
+        r"\midrule",
+        r"A\_1 & hold & \underline{0.512} \\",
+        r" & kalman & \textbf{$-$0.6\%} \\",
+        r"\midrule",
+        r"B & hold & -- \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+        "",
+    ])  # fmt: skip
+
+
+def test_latex_escapes():
+    assert tex("a_b & 50% #1 $x$ {~^\\}") == (
+        r"a\_b \& 50\% \#1 \$x\$ \{\textasciitilde{}\textasciicircum{}\textbackslash{}\}"
+    )
+    assert tex("x\ny\x00") == "x y "
+    assert tex("DTB70-ECO 0.1 [-0.2, -3]") == "DTB70-ECO 0.1 {[}$-$0.2, $-$3]"

@@ -1,0 +1,265 @@
+import json
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from fractions import Fraction
+from itertools import pairwise
+
+import jsonschema
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from places import REPOSITORY
+from trace_processor import queried
+
+import lae_sim
+from lae_sim.report.timeline import timeline_file, trace_events
+
+SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
+COSTS = {"hold": 0, "kalman": 0, "slow": 25_000_000}
+
+# From "Trace Event Format" (Google, 2016): the object format, metadata, complete and flow events.
+_PLACE = {
+    "pid": {"type": "integer"},
+    "tid": {"type": "integer"},
+    "name": {"type": "string"},
+    "args": {"type": "object"},
+}
+_TIME = {"ts": {"type": "number", "minimum": 0}}
+_KINDS = ["process_name", "process_sort_index", "thread_name", "thread_sort_index"]
+_FLOW = {**_PLACE, **_TIME, "cat": {"type": "string"}, "id": {"type": "integer"}}
+
+
+def _event(phase, properties, optional=("args",)):
+    return {
+        "type": "object",
+        "properties": {"ph": {"const": phase}, **properties},
+        "required": ["ph", *(name for name in properties if name not in optional)],
+        "additionalProperties": False,
+    }
+
+
+SCHEMA = {
+    "type": "object",
+    "properties": {
+        "displayTimeUnit": {"enum": ["ms", "ns"]},
+        "otherData": {"type": "object"},
+        "traceEvents": {
+            "type": "array",
+            "items": {
+                "oneOf": [
+                    _event("M", {**_PLACE, "name": {"enum": _KINDS}}, optional=()),
+                    _event("X", {**_PLACE, **_TIME, "dur": {"type": "number", "minimum": 0}}),
+                    _event("s", _FLOW),
+                    _event("f", {**_FLOW, "bp": {"const": "e"}}),
+                ]
+            },
+        },
+    },
+    "required": ["traceEvents"],
+    "additionalProperties": False,
+}
+
+
+def run(times_ms=(150, 100, 40, 40), fps=10, policy=lae_sim.latest):
+    boxes = np.zeros((len(times_ms), 4))
+    elapsed = np.array(times_ms) * 1_000_000
+    recording = lae_sim.Recording.new("sequence", boxes, boxes, elapsed)
+    return lae_sim.replay_sequence(recording, lae_sim.Clock.at(Fraction(fps)), policy=policy)
+
+
+def tracks(events):
+    """The slices of each named track, per process."""
+    names, found = {}, defaultdict(list)
+    for event in events:
+        if event["name"] == "thread_name":
+            names[event["pid"], event["tid"]] = event["args"]["name"]
+        elif event["ph"] == "X":
+            found[names[event["pid"], event["tid"]]].append(event)
+    return found
+
+
+def test_the_whole_story_of_four_frames():
+    found = tracks(trace_events(run(), Fraction(0), {"hold": 0}))
+    story = {
+        name: [(s["name"], s["ts"] / 1000, (s["ts"] + s["dur"]) / 1000) for s in slices]
+        for name, slices in found.items()
+    }
+    assert story == {
+        "camera": [(f"frame {i}", 100 * i, 100 * i + 100) for i in range(4)],
+        "tracker": [
+            ("frame 0", 0, 150), ("frame 1", 150, 250), ("frame 2", 250, 290),
+            ("frame 3", 300, 340),
+        ],
+        "forecaster hold": [("initial box", 0, 300), ("update 2", 300, 400)],
+        "queries": [
+            ("0 answers 0", 0, 100), ("0 answers 1", 100, 200), ("0 answers 2", 200, 300),
+            ("2 answers 3", 300, 400),
+        ],
+    }  # fmt: skip
+
+
+def test_a_declared_cost_delays_the_answers_of_its_forecaster_alone():
+    found = tracks(
+        trace_events(run((150, 40, 40, 40)), Fraction(0), {"hold": 0, "slow": 120_000_000})
+    )
+    assert list(found) == [
+        "camera", "tracker", "forecaster hold", "queries hold", "forecaster slow", "queries slow",
+    ]  # fmt: skip
+    free, slow = (found[f"queries {name}"] for name in ("hold", "slow"))
+    assert [s["args"]["source_frame"] for s in free] == [0, 0, 1, 2]
+    assert [s["args"]["source_frame"] for s in slow] == [0, 0, 0, 0]
+    found = tracks(trace_events(run((150, 40, 40, 40)), Fraction(0), {"slow": 20_000_000}))
+    update = found["forecaster slow"][-1]["args"]
+    assert (update["cost_ns"], update["delayed_queries"]) == (20_000_000, 0)
+    found = tracks(trace_events(run((150, 40, 40, 40)), Fraction(0), {"slow": 70_000_000}))
+    update = found["forecaster slow"][-1]["args"]
+    assert (update["source_frame"], update["delayed_queries"]) == (1, 1)
+
+
+@given(
+    times=st.lists(st.integers(0, 400), min_size=1, max_size=12),
+    fps=st.sampled_from(["10", "29.97", "30000/1001", "240"]),
+    sigma=st.fractions(-3, 3, max_denominator=50),
+    policy=st.sampled_from([lae_sim.latest, lae_sim.fifo, lae_sim.every(2)]),
+)
+def test_the_tracks_are_the_schedule_and_the_event_log(times, fps, sigma, policy):
+    replayed = run(times, fps, policy)
+    schedule, clock = replayed.schedule, replayed.schedule.clock
+    events = list(trace_events(replayed, sigma, COSTS))
+    found = tracks(events)
+    log = lae_sim.event_log(replayed, sigma)
+    camera, tracker, queries = (found[n] for n in ("camera", "tracker", "queries hold, kalman"))
+    assert [s["args"]["tick"] for s in camera] == [e.tick for e in log if e.kind == "frame arrived"]
+    assert [s["args"]["frame"] for s in camera if s["args"]["skipped"]] == [
+        e.frame for e in log if e.kind == "frame skipped"
+    ]
+    for name in ("frame", "start_ticks", "ready_ticks"):
+        expected = {"frame": "frames", "start_ticks": "start", "ready_ticks": "ready"}[name]
+        assert [s["args"][name] for s in tracker] == getattr(schedule, expected).tolist()
+    answered = [e for e in log if e.kind == "query answered"]
+    assert [
+        (s["args"]["tick"], s["args"]["frame"], s["args"]["source_frame"]) for s in queries
+    ] == [(e.tick, e.frame, e.source_frame) for e in answered]
+    assert all(
+        s["args"]["age_frames"] == s["args"]["frame"] - s["args"]["source_frame"] for s in queries
+    )
+    updated = [(e.tick, e.frame) for e in log if e.kind == "forecaster updated"]
+    for name in ("hold", "kalman"):
+        seen = [(s["args"]["tick"], s["args"]["source_frame"]) for s in found[f"forecaster {name}"]]
+        assert [each for each in seen if each[1]] == updated
+    # instants are whole nanoseconds, rounded down, exactly; slices never overlap
+    later = max(-int(sigma // 1), 0) * clock.frame_ticks
+    for name, slices in found.items():
+        spans = [(Fraction(str(s["ts"])), Fraction(str(s["dur"]))) for s in slices]
+        for (ts, _), s in zip(spans, slices):
+            tick = s["args"]["start_ticks" if name == "tracker" else "tick"]
+            assert ts * 1000 == (tick + later) // clock.ticks_per_ns
+        for (ts, dur), (following, _) in pairwise(spans):
+            assert dur >= 0
+            assert ts + dur <= following
+            assert name == "tracker" or ts + dur == following
+    # arrows lead from an output to the first query that it answers
+    flows = [e for e in events if e["ph"] in "sf"]
+    assert [e["ph"] for e in flows] == ["s", "f"] * (len(flows) // 2)
+    assert [a["id"] == b["id"] for a, b in zip(flows[::2], flows[1::2])] == [True] * (
+        len(flows) // 2
+    )
+    assert len({e["id"] for e in flows}) == len(flows) // 2
+    first = {s["args"]["source_frame"]: s["ts"] for s in reversed(queries)}
+    tid = queries[0]["tid"] if queries else None
+    assert [f["ts"] for f in flows if f["tid"] == tid] == [first[j] for j in sorted(first) if j]
+
+
+def replay(*arguments, status=0, cwd=None):
+    command = [sys.executable, "-W", "error", "-m", "lae_sim", "replay", *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=cwd)
+    assert done.returncode == status, done.stderr
+    return done.stderr if status else done.stdout
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Two sequences, where kalman's answers come later; the table says the same as without."""
+    path = tmp_path_factory.mktemp("timeline") / "out.json"
+    options = ("--sequence", "boat-calm", "car-chase", "--sigma", "1/2", "0")
+    text = replay(SLOW, *options, "--cost", "kalman=2ms", "--timeline", path)
+    assert text == replay(SLOW, *options, "--cost", "kalman=2ms")
+    return path
+
+
+def test_the_file_is_of_the_trace_event_format(written):
+    document = json.loads(written.read_text())
+    jsonschema.validate(document, SCHEMA)
+    assert document["otherData"] == {"sigma": "0.5"}
+    events = document["traceEvents"]
+    named = [e["args"]["name"] for e in events if e["name"] == "process_name"]
+    assert named == ["boat-calm", "car-chase"]
+    runs = lae_sim.replay_trace(lae_sim.read_trace(SLOW, named))
+    expected = [
+        event
+        for process, each in enumerate(runs, 1)
+        for event in trace_events(each, Fraction(1, 2), {"hold": 0, "kalman": 2_000_000}, process)
+    ]
+    assert events == expected
+
+
+def test_perfetto_loads_every_slice_and_flow(written):
+    events = json.loads(written.read_text())["traceEvents"]
+    slices, depth, flows, errors, threads = queried(
+        written,
+        "SELECT s.ts, s.dur, s.name, t.tid, p.name AS process, t.name AS thread FROM slice s "
+        "JOIN thread_track k ON s.track_id = k.id JOIN thread t USING (utid) "
+        "JOIN process p USING (upid) ORDER BY p.pid, t.tid, s.ts, s.id",
+        "SELECT max(depth) AS depth FROM slice",
+        "SELECT a.name AS output, b.name AS answer FROM flow "
+        "JOIN slice a ON slice_out = a.id JOIN slice b ON slice_in = b.id",
+        "SELECT name FROM stats WHERE value > 0 AND severity <> 'info'",
+        "SELECT name FROM thread WHERE is_main_thread AND name IS NOT NULL",
+    )
+    assert (errors, threads, depth) == ([], [], [{"depth": 0}])
+    processes = {e["pid"]: e["args"]["name"] for e in events if e["name"] == "process_name"}
+    expected = [
+        (round(e["ts"] * 1000), round(e["dur"] * 1000), e["name"], e["tid"], processes[e["pid"]])
+        for e in events
+        if e["ph"] == "X"
+    ]
+    columns = ("ts", "dur", "name", "tid", "process")
+    assert [tuple(row[name] for name in columns) for row in slices] == expected
+    assert len(flows) == sum(e["ph"] == "f" for e in events) > 800
+    for row in flows:
+        assert row["output"].removeprefix("frame ") == row["answer"].split()[0]
+
+
+def test_a_picture_of_the_first_sequence(tmp_path):
+    replay(SLOW, "--timeline", tmp_path / "out.svg", "--sequence", "car-chase", "boat-calm")
+    assert "boat-calm: who answers what" in (tmp_path / "out.svg").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([SLOW, "--timeline", "out.txt"], "name a .json file, for Perfetto, or a .png"),
+        ([SLOW, "--timeline", "out.png", "--cost", "2ms"], "cannot show what forecasters cost"),
+        ([SLOW, "--timeline", "out.json", "--policy", "vot-realtime"], "no --timeline"),
+        ([SLOW, "--timeline", "out.json", "--events", "out.json"], "or another output"),
+        ([SLOW, SLOW.with_name("synthetic-fast.parquet"), "--timeline", "o.json"], "one trace"),
+    ],
+)
+def test_what_cannot_be_drawn_is_said_and_leaves_nothing(arguments, words, tmp_path):
+    assert words in replay(*arguments, status=2, cwd=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_leaves_no_timeline(tmp_path):
+    def fails():
+        with timeline_file(str(tmp_path / "o.json"), Fraction(0), {}) as sink:
+            sink(run())
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fails()
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,122 @@
+"""What a study asks for: keys, exact values, and one clear line for whatever is wrong."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lae_sim.errors import LaeError
+from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.study.spec import _KEYS, Study, read_study
+
+
+def written(tmp_path: Path, text: str) -> str:
+    path = tmp_path / "study.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_defaults_are_those_of_replay(tmp_path: Path) -> None:
+    study = read_study(written(tmp_path, 'traces = "a.parquet"'))
+    assert study == Study(("a.parquet",))
+    assert (study.forecasters, study.sigmas, study.fps) == (("hold", "kalman"), (0,), (None,))
+
+
+def test_numbers_are_exact_as_they_are_written(tmp_path: Path) -> None:
+    study = read_study(
+        written(
+            tmp_path,
+            """
+            traces = ["a.parquet", "b.parquet", "a.parquet"]
+            fps = ["trace", 29.97, "30000/1001", 60]
+            scales = [0.1, "1/3", 2]
+            sigma = [1, 0, 0.02]
+            require_auc = 0.55
+            """,
+        )
+    )
+    assert study.traces == ("a.parquet", "b.parquet")
+    assert study.fps == (None, Fraction(2997, 100), Fraction(30000, 1001), 60)
+    assert study.scales == (Fraction(1, 10), Fraction(1, 3), 2)
+    assert study.sigmas == (0, Fraction(1, 50), 1)
+    assert study.require_auc == Fraction(11, 20)
+
+
+def test_the_grid_of_sigmas_has_a_name() -> None:
+    assert Study.of({"traces": "a", "sigma": "grid"}).sigmas == SIGMA_GRID
+
+
+def test_a_study_survives_its_document() -> None:
+    study = Study.of({"traces": "a", "scales": ["1/3"], "latencies": ["bootstrap"], "block": 5})
+    document = study.document()
+    document["sigma"] = document.pop("sigmas")
+    kept = {key: value for key, value in document.items() if value not in (None, [], [None])}
+    assert Study.of(kept) == study
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "the key 'traces' is missing"),
+        ("traces = []", "traces: the list is empty"),
+        ('traces = "a"\nforcasters = ["hold"]', "unknown key 'forcasters': did you mean 'foreca"),
+        ('traces = "a"\nxyz = 1', "unknown key 'xyz': there are traces, timing"),
+        ('traces = "a"\nscales = [-1]', "scales: times cannot be scaled by less than 0"),
+        ('traces = "a"\nscales = [true]', "scales: True is not an exact number"),
+        ('traces = "a"\nscales = [1e3]', "scales: '1e3' is not an exact number"),
+        ('traces = "a"\nfps = [0]', "fps: a frame rate must be above zero"),
+        ('traces = "a"\nlatencies = ["47ms"]', "latencies: no latency '47ms'"),
+        ('traces = "a"\nlatencies = ["bootstrap:3"]', "in a study the keys seed and block say so"),
+        ('traces = "a"\npolicies = ["last"]', "no policy 'last'"),
+        ('traces = "a"\npolicies = ["vot-realtime"]', "never scores latency"),
+        ('traces = "a"\nconventions = ["pysott"]', "no convention 'pysott'"),
+        ('traces = "a"\nforecasters = ["offline"]', "offline is the tracker's own score"),
+        ('traces = "a"\nrepetitions = 0', "repetitions: 0 is not a whole number from 1"),
+        ('traces = "a"\nrepetitions = 2.0', "repetitions: '2.0' is not a whole number"),
+        ('traces = "a"\nseed = -1', "seed: -1 is not a whole number from 0"),
+        ('traces = "a"\nattributes = "yes"', "attributes: 'yes' is neither true nor false"),
+        ('traces = "a"\nrequire_auc = 1.5', "require_auc: an AUC is between 0 and 1, not 3/2"),
+        ('traces = "a"\ncosts = ["measured"]', "costs: declare a time"),
+        ('traces = "a"\nsequences = [3]', "sequences: 3 is not text"),
+        ("traces = [", "study.toml: "),
+        ('traces = "a"\n[world]\nfps = 3', "unknown key 'world'"),
+    ],
+)
+def test_what_is_wrong_is_one_line_that_names_the_file_and_the_key(
+    text: str, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(LaeError) as caught:
+        read_study(written(tmp_path, text))
+    message = str(caught.value)
+    assert said in message
+    assert message.startswith(str(tmp_path))
+    assert "\n" not in message
+
+
+def test_a_missing_file_and_bytes_that_are_no_text(tmp_path: Path) -> None:
+    with pytest.raises(LaeError, match="cannot be read"):
+        read_study(str(tmp_path / "none.toml"))
+    (tmp_path / "b.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(LaeError, match="cannot be read"):
+        read_study(str(tmp_path / "b.toml"))
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=4,
+)
+
+
+@given(st.dictionaries(st.sampled_from(list(_KEYS)) | st.text(max_size=5), values, max_size=4))
+def test_whatever_is_given_is_a_study_or_an_error(document: dict[str, Any]) -> None:
+    try:
+        study = Study.of({"traces": "a", **document})
+    except LaeError:
+        return
+    assert isinstance(study, Study)
