@@ -11,10 +11,11 @@ demo: $(VENV)/.demo  ## replay the sample traces
 test: $(VENV)/.test  ## run the tests
 	$(BIN)/python -m pytest -n auto
 
-lint: $(VENV)/.dev  ## format, lint and types
+lint: $(VENV)/.dev  ## format, lint, types and the order of imports
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 bench: $(VENV)/.test  ## measure speed and memory
 	$(BIN)/python benchmarks/run.py

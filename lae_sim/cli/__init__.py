@@ -1,1 +1,1 @@
-"""Room cli."""
+"""The command lines: options become records, records go to the rooms, answers are printed."""

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli.options import add_forecasting, add_worlds, argument, exit_status, new_parser
-from lae_sim.engine.clock import parse_rational
+from lae_sim.engine.clock import parse_rational, whole
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, check_folders, labels
 from lae_sim.learning.registry import FORECASTERS, find_camera, load_any
-from lae_sim.replay.world import parse_policy, whole
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -119,6 +118,8 @@ def _check(arguments: argparse.Namespace) -> None:
         from lae_sim.report.figures import check_format
 
         check_format(arguments.plot)
+    from lae_sim.replay.world import parse_policy
+
     if parse_policy(arguments.policy)[1]:
         raise LaeError("vot-realtime never scores latency: there is nothing to forecast")
     if "offline" in arguments.forecaster:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli.options import exit_status, new_parser
-from lae_sim.comparison.fidelity import GROUP, Row, compared, summarised
+
+if TYPE_CHECKING:
+    from lae_sim.comparison.fidelity import Row
 
 PROGRAM = "lae-sim fidelity"
 
@@ -79,6 +81,7 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     import json
 
     from lae_sim import __version__
+    from lae_sim.comparison.fidelity import GROUP, compared, summarised
 
     closed_loops = dict.fromkeys(arguments.closed_loop)
     rows = [row for path in closed_loops for row in compared(path, arguments)]

@@ -7,11 +7,13 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from lae_sim.engine.clock import parse_fps, parse_rational
+from lae_sim.engine.clock import parse_fps, parse_rational, whole
 from lae_sim.errors import LaeError
-from lae_sim.replay.world import World, parse_latency, parse_policy, whole
+
+if TYPE_CHECKING:
+    from lae_sim.replay.world import World
 
 
 def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
@@ -190,6 +192,8 @@ def parse_world(arguments: argparse.Namespace) -> World:
     Raises:
         LaeError: if there is no such policy or latency.
     """
+    from lae_sim.replay.world import World, parse_latency, parse_policy
+
     return World(
         {name: parse_latency(name) for name in dict.fromkeys(arguments.latency)},
         list(dict.fromkeys(arguments.latency_scale)),

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
 from lae_sim.cli.options import argument, exit_status, new_parser, parse_box, parse_stride
-from lae_sim.engine.clock import NS_PER_SECOND, parse_duration, parse_fps
+from lae_sim.engine.clock import NS_PER_SECOND, parse_duration, parse_fps, whole
 from lae_sim.errors import LaeError
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.plugins import key_and_value
-from lae_sim.replay.world import parse_policy, whole
 
 if TYPE_CHECKING:
     from lae_sim.datasets.frames import Dataset, ImageSequence
@@ -288,6 +287,8 @@ def _passes(
     from lae_sim.replay.strides import phases
 
     clock = Clock.at(dataset.fps)
+    from lae_sim.replay.world import parse_policy
+
     policy, _ = parse_policy(arguments.policy or "latest")
     mode = arguments.mode or (
         "real-time" if arguments.policy or arguments.timing else "every-frame"

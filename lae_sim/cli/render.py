@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from lae_sim.cli.options import add_world, exit_status, new_parser
 from lae_sim.errors import LaeError
 from lae_sim.learning.registry import load_forecaster
-from lae_sim.replay.world import parse_latency, parse_policy
 from lae_sim.report.film import Scene
 
 if TYPE_CHECKING:
@@ -111,6 +110,7 @@ def _replayed(arguments: argparse.Namespace) -> tuple[Metadata, list[Run], bool]
     """The trace's metadata, its replayed sequences, and whether outputs count at arrival."""
     from lae_sim.replay.latency import scaled
     from lae_sim.replay.run import replay_trace
+    from lae_sim.replay.world import parse_latency, parse_policy
     from lae_sim.trace.file import read_trace
 
     policy, at_arrival = parse_policy(arguments.policy)

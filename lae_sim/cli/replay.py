@@ -15,7 +15,6 @@ from lae_sim.engine.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, labels
 from lae_sim.learning.registry import FORECASTERS, find_camera, load_forecaster
-from lae_sim.replay.world import parse_latency, parse_policy
 
 if TYPE_CHECKING:
     from lae_sim.engine.clock import Clock
@@ -307,6 +306,7 @@ def jobs_of(
     from lae_sim.forecast.costs import resolve_costs
     from lae_sim.replay.latency import scaled
     from lae_sim.replay.run import replay_trace
+    from lae_sim.replay.world import parse_latency, parse_policy
     from lae_sim.trace.file import read_trace
 
     policy, at_arrival = parse_policy(arguments.policy)

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Sequence
 
 from lae_sim.cli.options import exit_status
-from lae_sim.trace.describe import describe
 
 _EXAMPLES = """\
 examples:
@@ -38,6 +37,7 @@ def _show(arguments: argparse.Namespace) -> None:
     from lae_sim import __version__
     from lae_sim.files import check_distinct
     from lae_sim.report.trace import overview, plot_times
+    from lae_sim.trace.describe import describe
     from lae_sim.trace.file import read_trace
     from lae_sim.trace.locate import find_traces
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser
+from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError
-from lae_sim.replay.world import whole
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults

@@ -8,9 +8,9 @@ from fractions import Fraction
 from functools import partial
 
 from lae_sim.cli.options import add_worlds, argument, exit_status, new_parser
+from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, check_folders
-from lae_sim.replay.world import whole
 
 PROGRAM = "lae-sim train"
 

@@ -1,1 +1,1 @@
-"""Room comparison."""
+"""Comparing forecasters and replays: intervals, paired tests, distances to closed loops."""

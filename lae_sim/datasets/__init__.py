@@ -1,1 +1,1 @@
-"""Room datasets."""
+"""Datasets as their publishers lay them out: frames, ground truth, attributes; and made-up ones."""

@@ -63,6 +63,17 @@ def parse_duration(text: str) -> int:
     return int(duration)
 
 
+def whole(text: str, least: int = 0) -> int:
+    """A whole number from ``least``.
+
+    Raises:
+        LaeError: if the text is none.
+    """
+    if not (text.isascii() and text.isdigit() and len(text) < 19 and int(text) >= least):
+        raise LaeError(f"{text!r} is not a whole number from {least}")
+    return int(text)
+
+
 @dataclass(frozen=True)
 class Clock:
     """The tick clock of one world frame rate.

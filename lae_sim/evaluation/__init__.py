@@ -1,1 +1,1 @@
-"""Room evaluation."""
+"""Scores: which output answers which query, and how far the answers are from the truth."""

@@ -1,1 +1,1 @@
-"""Room importers."""
+"""Results that other toolkits have written, as recordings of a trace."""

@@ -1,1 +1,1 @@
-"""Room learning."""
+"""Forecasters by name, and the training of those that learn, across folds of the sequences."""

@@ -1,1 +1,1 @@
-"""Room replay."""
+"""Replaying recordings: under which world, with which processing times and boxes."""

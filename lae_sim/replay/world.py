@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.engine.clock import parse_duration
+from lae_sim.engine.clock import parse_duration, whole
 from lae_sim.engine.policies import latest
 from lae_sim.engine.scheduler import Policy
 from lae_sim.errors import LaeError
@@ -116,17 +116,6 @@ def _own(what: str, text: str) -> Any:
 
     found = imported(f"{what} {text!r}", text)
     return bound(f"{what} {text!r}", found, [], {}) if isinstance(found, type) else found
-
-
-def whole(text: str, least: int = 0) -> int:
-    """A whole number from ``least``.
-
-    Raises:
-        LaeError: if the text is none.
-    """
-    if not (text.isascii() and text.isdigit() and len(text) < 19 and int(text) >= least):
-        raise LaeError(f"{text!r} is not a whole number from {least}")
-    return int(text)
 
 
 def _number(text: str, value: str, least: int = 0) -> int:

@@ -1,1 +1,1 @@
-"""Room report."""
+"""What people look at: tables as text, CSV, LaTeX and HTML; figures, pages, films, timelines."""

@@ -375,7 +375,7 @@ def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
         process.send_signal(signal.SIGKILL)
     done = len(list(out.glob("results/[!.]*.parquet")))
     assert 3 <= done < 64
-    told = study_command(*asked[5:], cwd=tmp_path)
+    told = study_command(*asked[6:], cwd=tmp_path)
     assert f"64 cells, {64 - done} of them computed now" in told
     whole = tmp_path / "whole"
     study_command(path, "--out", whole, "--workers", 1, "--no-report", cwd=tmp_path)

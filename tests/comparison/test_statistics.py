@@ -11,10 +11,10 @@ import pytest
 from scipy.stats import rankdata, wilcoxon
 from tidy_scores import random_scores, tidy
 
-from lae_sim.comparison import statistics
 from lae_sim.comparison.statistics import by_attribute, signed_rank_p, summarise
 from lae_sim.errors import LaeError
 from lae_sim.report.forecasters import comparison_table
+from lae_sim.report.table import p_label, setting_label
 
 KEYS = ["trace", "latency", "scale", "sigma", "forecaster", "metric"]
 
@@ -327,11 +327,11 @@ def test_the_text_table_names_sigmas_and_attributes_where_there_are_some():
 
 
 def test_labels():
-    assert [statistics.p_label(p) for p in (0.0129, 1.0, 1e-9, math.nan)] == [
+    assert [p_label(p) for p in (0.0129, 1.0, 1e-9, math.nan)] == [
         "0.013",
         "1.000",
         "<0.001",
         "-",
     ]
-    assert statistics.setting_label("recorded", 1) == "recorded"
-    assert statistics.setting_label("constant:47ms", 0.5) == "constant:47ms x 0.5"
+    assert setting_label("recorded", 1) == "recorded"
+    assert setting_label("constant:47ms", 0.5) == "constant:47ms x 0.5"

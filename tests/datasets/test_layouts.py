@@ -188,6 +188,7 @@ def test_real_sequences(shared_data):
         "MountainBike6": 81,
         "Couple": 140,
         "Dog1": 1350,
+        "boat1": 301,
         "building5": 161,
         "wakeboard7": 67,
     }

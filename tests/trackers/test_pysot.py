@@ -16,7 +16,7 @@ from lae_sim.trackers.names import make_tracker
 
 torch = pytest.importorskip("torch", reason="pysot is a toolkit for PyTorch")
 
-from lae_sim.trackers.pysot import PySot
+from lae_sim.trackers.pysot import PySot  # noqa: E402
 
 # A toolkit of the layout of pysot, small: its tracker says what it crops and how bright that is.
 FAKE = {

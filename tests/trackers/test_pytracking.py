@@ -17,8 +17,8 @@ from lae_sim.trackers.names import make_tracker
 torch = pytest.importorskip("torch", reason="pytracking is a toolkit for PyTorch")
 pytest.importorskip("cv2", reason="pytracking needs OpenCV")
 
-from lae_sim.trackers.checkout import stand_ins
-from lae_sim.trackers.pytracking import _UNUSED, PyTracking, precise_roi_pooling
+from lae_sim.trackers.checkout import stand_ins  # noqa: E402
+from lae_sim.trackers.pytracking import _UNUSED, PyTracking, precise_roi_pooling  # noqa: E402
 
 # A toolkit of the layout of pytracking, small: its tracker pools an image around its position.
 FAKE = {
