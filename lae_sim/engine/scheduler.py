@@ -96,8 +96,8 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
             f"the output of frame {frame} is ready at tick {ready}, beyond 64 bits: "
             f"check the processing times, or write the frame rate {clock.fps} more simply"
         ) from error
-    frames, start, ready = flat.reshape(-1, 3).T.copy()
-    return Schedule(clock, length, frames, start, ready, scores_latency(policy))
+    frames, starts, readies = flat.reshape(-1, 3).T.copy()
+    return Schedule(clock, length, frames, starts, readies, scores_latency(policy))
 
 
 def scores_latency(policy: Policy) -> bool:
