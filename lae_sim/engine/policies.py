@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
 from lae_sim._arrays import Ints
-from lae_sim.engine.clock import Clock
+from lae_sim.engine.clock import Clock, duration_ns
 from lae_sim.engine.scheduler import Call, Policy
 
 
@@ -104,7 +104,7 @@ def every(n: int) -> LanePolicy:
     return _Every(n)
 
 
-def shrinking_tail(expected_ns: int) -> LanePolicy:
+def shrinking_tail(expected: str | None = None, *, ns: int | None = None) -> LanePolicy:
     """The newest frame, or the next one if waiting for it lowers the expected tail.
 
     Li, Wang and Ramanan, "Towards Streaming Perception" (2020), Alg. 1: with the tail
@@ -112,9 +112,13 @@ def shrinking_tail(expected_ns: int) -> LanePolicy:
     iff tau(s + r) < tau(s). A tracker that needs at most one frame interval never waits.
 
     Args:
-        expected_ns: the expected processing time r, ns.
+        expected: the expected processing time r with its unit, such as ``"47ms"``.
+        ns: the same in nanoseconds.
+
+    Raises:
+        LaeError: if it is not a duration.
     """
-    return _ShrinkingTail(expected_ns)
+    return _ShrinkingTail(duration_ns(expected, ns))
 
 
 def listed(frames: Sequence[int]) -> Policy:
@@ -128,27 +132,32 @@ def listed(frames: Sequence[int]) -> Policy:
     return next_listed
 
 
+@dataclass(frozen=True)
+class _VotRealtime:
+    grace: int
+    scores_latency: ClassVar[bool] = False
+
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        interval = clock.frame_ticks
+        last, start, ready = calls[-1]
+        overtime = ready - start - interval
+        skipped = 0
+        if overtime > interval and _late_calls(calls, interval, self.grace + 1) > self.grace:
+            skipped = -(-overtime // interval) - 1
+        following = last + 1 + skipped
+        return following, following * interval
+
+
 def vot_realtime(grace: int = 3) -> Policy:
     """The real-time rule of the VOT toolkit, which skips frames but never scores latency.
 
     Every call starts at its frame's arrival, as if the tracker were free. A call that takes longer
     than the frame interval owes its overtime: while more than one interval is owed, a frame is
     skipped and one interval repaid; what is left is forgiven. The first ``grace`` calls over time
-    owe nothing (VOT 2022: 3). The toolkit scores each output at its own frame, so evaluate such a
-    schedule with ``at_arrival=True``.
+    owe nothing (VOT 2022: 3). The toolkit scores each output at its own frame, and so does
+    whatever evaluates such a schedule (see :class:`.scheduler.Schedule`).
     """
-
-    def repay_whole_frames(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
-        interval = clock.frame_ticks
-        last, start, ready = calls[-1]
-        overtime = ready - start - interval
-        skipped = 0
-        if overtime > interval and _late_calls(calls, interval, grace + 1) > grace:
-            skipped = -(-overtime // interval) - 1
-        following = last + 1 + skipped
-        return following, following * interval
-
-    return repay_whole_frames
+    return _VotRealtime(grace)
 
 
 def _late_calls(calls: Sequence[Call], interval: int, most: int) -> int:

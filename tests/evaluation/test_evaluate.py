@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 
@@ -29,11 +30,11 @@ from lae_sim.engine.policies import vot_realtime
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import Evaluation, answers, evaluate
 from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, precision_curve, success_curve
-from lae_sim.evaluation.pairing import SIGMA_GRID
 from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
 from lae_sim.replay.latency import constant
 from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
@@ -167,15 +168,18 @@ def test_evaluation_agrees_with_the_event_driven_world(
 @given(groups(), st.booleans())
 @settings(max_examples=25)
 def test_the_grid_is_its_sigmas_one_by_one_and_groups_are_their_sequences(
-    group: tuple[Fraction, list[Recording]], at_arrival: bool
+    group: tuple[Fraction, list[Recording]], scores_latency: bool
 ) -> None:
     fps, recordings = group
     runs = [replay_sequence(recording, Clock.at(fps)) for recording in recordings]
+    runs = [
+        replace(run, schedule=replace(run.schedule, scores_latency=scores_latency)) for run in runs
+    ]
     sigmas = [Fraction(-1, 2), *SIGMA_GRID[::5], Fraction(4, 3)]
-    together = evaluate(runs, EVERY, FORECASTERS, sigmas, at_arrival=at_arrival)
+    together = evaluate(runs, EVERY, FORECASTERS, sigmas)
     for s, run in enumerate(runs):
         for m, sigma in enumerate(sigmas):
-            alone = evaluate([run], EVERY, FORECASTERS, [sigma], at_arrival=at_arrival)
+            alone = evaluate([run], EVERY, FORECASTERS, [sigma])
             for metric in METRICS:
                 np.testing.assert_array_equal(
                     together.scores[metric][:, s, m], alone.scores[metric][:, 0, 0]
@@ -204,7 +208,7 @@ def test_kalman_lae_pvt_agrees_with_matrices_through_answers() -> None:
     metadata = Metadata.new("30", "every-frame", sequences={"a": {"image_size": list(size)}})
     for seed in range(6):
         recording = moving(150, seed)
-        run = replay_sequence(recording, CLOCK, constant(90_000_000))
+        run = replay_sequence(recording, CLOCK, constant(ns=90_000_000))
         for sigma in (Fraction(0), Fraction(1, 2), Fraction(-1)):
             told = answers(run, metadata, "kalman-lae-pvt", KalmanLaePvt, sigma)
             expected = follow(
@@ -282,7 +286,7 @@ def test_joined_is_the_evaluation_of_all() -> None:
 def test_vot_scores_each_output_at_its_own_frame() -> None:
     recording = moving(50, elapsed=10_000_000)
     run = replay_sequence(recording, CLOCK, policy=vot_realtime())
-    found = evaluate([run], EVERY, {"hold": Hold}, at_arrival=True)
+    found = evaluate([run], EVERY, {"hold": Hold})
     for metric in METRICS:
         assert found.scores[metric].item() == found.offline[metric].item()
     assert found.mismatch_sum.item() == 0
