@@ -143,11 +143,11 @@ def _rows(
         if trace.metadata.kind != "every-frame":
             raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
     schedule = closed.metadata.document["schedule"]
-    policy, at_arrival = parse_policy(schedule.get("policy", "latest"))
+    policy = parse_policy(schedule.get("policy", "latest"))
 
     def scores(runs: list[Run]) -> Mapping[str, Floats]:
         sigmas = (Fraction(0),)
-        return evaluate(runs, closed.metadata, forecasters, sigmas, convention, at_arrival).scores
+        return evaluate(runs, closed.metadata, forecasters, sigmas, convention).scores
 
     replay = partial(replay_trace, every, closed.metadata.fps, policy=policy, timing=closed)
     closed_runs = list(replay_trace(closed, policy=policy))
