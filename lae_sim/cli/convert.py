@@ -6,10 +6,12 @@ import argparse
 import json
 import re
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser
+from lae_sim.cli.progress import ProgressBar
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct
 
@@ -86,19 +88,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _convert(arguments: argparse.Namespace) -> None:
-    from tqdm import tqdm
-
     from lae_sim.importers.convert import convert_results
     from lae_sim.trace.file import write_trace
 
     truth_files = dict(arguments.truth_file)
     check_distinct([arguments.out], [arguments.results, *truth_files.values()])
-    with tqdm(desc="convert", unit=" sequences", disable=None) as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with closing(ProgressBar("convert", "sequences")) as bar:
         trace, summary = convert_results(
             arguments.results,
             arguments.truth,
@@ -115,7 +110,7 @@ def _convert(arguments: argparse.Namespace) -> None:
             truth_files=truth_files,
             skip_missing=arguments.skip_missing,
             image_size=arguments.image_size,
-            progress=progress,
+            progress=bar,
         )
     check_distinct([arguments.out], summary.files)
     write_trace(trace, arguments.out)

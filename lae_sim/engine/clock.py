@@ -48,6 +48,18 @@ def parse_fps(text: str) -> Fraction:
     return fps
 
 
+def parse_stride(text: str) -> Fraction:
+    """Read the stride of a pass (see :mod:`lae_sim.replay.strides`), such as ``2`` or ``3/2``.
+
+    Raises:
+        LaeError: if it is not an exact number above 1, or its numerator is above 1000.
+    """
+    stride = parse_rational(text)
+    if not (stride > 1 and stride.numerator <= 1000):
+        raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {text!r}")
+    return stride
+
+
 def parse_duration(text: str) -> int:
     """Read a duration with its unit (``"47ms"``, ``"0.1s"``) as integer nanoseconds.
 
