@@ -84,7 +84,7 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     rows = compare_closed_loops(
         arguments.trace,
         arguments.closed_loop,
-        strided=arguments.strided,
+        passes=arguments.strided,
         forecasters=arguments.forecaster,
         convention=arguments.convention,
     )

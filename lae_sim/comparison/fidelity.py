@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
 
 import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.boxes import PARTED_IOU, iou
+from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate
 from lae_sim.evaluation.metrics import Convention, find_convention
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import load_forecaster
-from lae_sim.replay.run import Run, replay_trace
+from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import parse_policy
 from lae_sim.trace.file import Trace, read_trace
 
@@ -86,7 +86,7 @@ def compare_closed_loops(
     trace: str,
     closed_loops: Sequence[str],
     *,
-    strided: Sequence[str] = (),
+    passes: Sequence[str] = (),
     forecasters: Sequence[str] = ("hold",),
     convention: str = "pysot",
 ) -> list[FidelityRow]:
@@ -95,13 +95,13 @@ def compare_closed_loops(
     Args:
         trace: path of a trace of every frame.
         closed_loops: paths of real-time traces of the same tracker.
-        strided: paths of passes on every N-th frame.
+        passes: paths of traces of passes on every N-th frame.
         forecasters: names (see :func:`lae_sim.learning.registry.load_forecaster`).
         convention: how frames and thresholds count, by name.
 
     Returns:
-        A row per closed loop, replay, forecaster and sequence; the replay of ``strided`` is there
-        if they are given.
+        A row per closed loop, replay, forecaster and sequence; the replay ``"strided"`` is there
+        if ``passes`` are given.
 
     Raises:
         LaeError: if a trace cannot be read, is not of the kind needed or of another tracker, or
@@ -112,7 +112,7 @@ def compare_closed_loops(
     return [
         row
         for path in dict.fromkeys(closed_loops)
-        for row in _rows(path, [trace, *strided], factories, scoring)
+        for row in _rows(path, [trace, *passes], factories, scoring)
     ]
 
 
@@ -137,8 +137,8 @@ def _rows(
             "'lae-sim profile --closed-loop' or '--mode real-time' left"
         )
     names = [recording.name for recording in closed]
-    every, *strided = (read_trace(other, names) for other in replayed)
-    for trace in (every, *strided):
+    every, *passes = (read_trace(other, names) for other in replayed)
+    for trace in (every, *passes):
         _check_same_tracker(closed, trace)
         if trace.metadata.kind != "every-frame":
             raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
@@ -149,11 +149,12 @@ def _rows(
         sigmas = (Fraction(0),)
         return evaluate(runs, closed.metadata, forecasters, sigmas, convention).scores
 
-    replay = partial(replay_trace, every, closed.metadata.fps, policy=policy, timing=closed)
-    closed_runs = list(replay_trace(closed, policy=policy))
-    replays = {"every-frame": list(replay())}
-    if strided:
-        replays["strided"] = list(replay(strided=strided))
+    clock = Clock.at(closed.metadata.fps)
+    closed_runs = list(Runs(closed, clock, policy=policy))
+    replays = {"every-frame": list(Runs(every, clock, policy=policy, timing=closed))}
+    if passes:
+        strided = Runs(every, clock, policy=policy, timing=closed, passes=tuple(passes))
+        replays["strided"] = list(strided)
     closed_scores = scores(closed_runs)
     for kind, runs in replays.items():
         replay_scores = scores(runs)

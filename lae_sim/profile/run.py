@@ -74,7 +74,7 @@ class ProfilePlan:
         include_decode: whether times include the decoding of frames.
 
     Raises:
-        LaeError: if settings do not go with each other.
+        LaeError: if some do not go together.
     """
 
     tracker: str = "dcf"
@@ -112,26 +112,26 @@ class ProfilePlan:
             raise LaeError("--translate and --keep-size are ways to use a --pre-forecaster")
 
     @classmethod
-    def parse(cls, **settings: Any) -> ProfilePlan:
-        """A plan from its fields, of which some may be text, as on the command line.
+    def of(cls, **settings: Any) -> ProfilePlan:
+        """A plan from text and plain numbers, as command lines have them.
 
         Args:
-            settings: the fields by name; ``fps`` and ``strides`` may be text (``"30000/1001"``,
+            settings: the attributes by name; ``fps`` and ``strides`` may be text (``"30000/1001"``,
                 ``"3/2"``) or numbers, ``frame_timeout`` and ``pre_forecaster_cost`` text
                 (``"2ms"``, ``"measured"``).
 
         Raises:
-            LaeError: if a text does not fit, or settings do not go with each other.
+            LaeError: if a value is impossible, or some do not go together.
         """
-        given = dict(settings)
-        if not isinstance(given.get("fps"), (Fraction, type(None))):
-            given["fps"] = parse_fps(str(given["fps"]))
-        if "strides" in given:
-            given["strides"] = tuple(parse_stride(str(stride)) for stride in given["strides"])
+        exact = dict(settings)
+        if exact.get("fps") is not None:
+            exact["fps"] = parse_fps(exact["fps"])
+        if "strides" in exact:
+            exact["strides"] = tuple(map(parse_stride, exact["strides"]))
         for name, parse in (("frame_timeout", parse_duration), ("pre_forecaster_cost", parse_cost)):
-            if isinstance(given.get(name), str):
-                given[name] = parse(given[name])
-        return cls(**given)
+            if isinstance(exact.get(name), str):
+                exact[name] = parse(exact[name])
+        return cls(**exact)
 
     @property
     def real_time(self) -> bool:
@@ -180,12 +180,12 @@ def profile_tracker(
         progress: ``progress(done, total)`` is called with world frames, before the first and after
             each.
         notice: called with each line that a user should read.
-        settings: fields of :class:`ProfilePlan` by name, as text or as values.
+        settings: attributes of :class:`ProfilePlan`, as :meth:`ProfilePlan.of` takes them.
 
     Raises:
         LaeError: if something cannot be used, or no sequence could be profiled.
     """
-    plan = ProfilePlan.parse(tracker=tracker, **settings)
+    plan = ProfilePlan.of(tracker=tracker, **settings)
     dataset = find_dataset(plan.dataset, plan.root, plan.sequences, plan.box, plan.fps)
     path = _trace_path(out, f"{tracker}-{dataset.name}")
     unfinished = path.with_suffix(".unfinished")

@@ -52,9 +52,9 @@ def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
     """One search for all cells that differ in their scale or repetitions alone."""
     counts: dict[Cell, int] = {}
     for cell in cells:
-        setting = replace(
-            cell.setting, scale=Fraction(1), first=0, count=1, sigmas=cell.setting.sigmas[:1]
-        )
+        world = cell.setting.world
+        world = replace(world, scale=Fraction(1), sigmas=world.sigmas[:1])
+        setting = replace(cell.setting, world=world, first=0, count=1)
         alike = replace(cell, setting=setting)
         counts[alike] = max(counts.get(alike, 1), cell.setting.first + cell.setting.count)
     return [
@@ -104,13 +104,13 @@ def slowest(search: Search) -> dict[str, Any]:
 def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
     """The mean AUC over sequences and repetitions at a scale of all times."""
     cell = search.cell
-    setting = replace(cell.setting, scale=scale)
+    setting = replace(cell.setting, world=replace(cell.setting.world, scale=scale))
     parts = evaluate_groups(
         (run for _, run in replayed(setting, trace).runs),
         trace.metadata,
         {cell.forecaster: search.factory},
-        setting.sigmas,
-        find_convention(cell.convention),
+        setting.world.sigmas,
+        find_convention(cell.setting.world.convention),
         costs={cell.forecaster: cell.cost_ns},
     )
     scores = np.concatenate([part.scores["auc"][0, :, 0] for part in parts])
@@ -135,9 +135,9 @@ def requirement(search: Search, found: Mapping[str, Any]) -> dict[str, Any]:
         "policy": setting.policy,
         "fps": str(setting.fps),
         "latency": setting.latency,
-        "convention": search.cell.convention,
+        "convention": search.cell.setting.world.convention,
         "forecaster": search.cell.forecaster,
-        "sigma": str(setting.sigmas[0]),
+        "sigma": str(setting.world.sigmas[0]),
         "required_auc": float(search.required),
         **found,
         "speed_up": None if not scale else float(1 / scale),

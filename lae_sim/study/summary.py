@@ -19,7 +19,7 @@ from lae_sim._arrays import Floats
 from lae_sim.comparison.statistics import Counts, bootstrap_counts, resampled_means, signed_rank_p
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.cells import Cell, Setting
 from lae_sim.study.plan import Plan, Source
 from lae_sim.study.rows import COLUMNS, read_rows
@@ -72,7 +72,7 @@ class Scores:
             setting.policy,
             str(setting.fps),
             setting.latency,
-            str(setting.scale),
+            str(setting.world.scale),
             self.convention,
         )
 
@@ -89,7 +89,7 @@ def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
     together: dict[tuple[Any, ...], list[Cell]] = {}
     for cell in plan.cells:
         same = replace(cell.setting, first=0, count=1)
-        together.setdefault((same, cell.forecaster, cell.convention), []).append(cell)
+        together.setdefault((same, cell.forecaster, cell.setting.world.convention), []).append(cell)
     for cells in together.values():
         if all(store.has(cell) for cell in cells):
             yield _read(cells, sources[cells[0].setting.trace], store)
@@ -98,7 +98,7 @@ def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
 def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
     """The scores of cells that differ in their repetitions alone."""
     first = cells[0]
-    count = len(first.setting.sigmas)
+    count = len(first.setting.world.sigmas)
     numbers = [*METRICS, *_STALENESS]
     found: dict[str, Any] = {}
     repeated: dict[str, list[Floats]] = {name: [] for name in _REPEATED}
@@ -138,7 +138,7 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
         source=source,
         setting=first.setting,
         forecaster=first.forecaster,
-        convention=first.convention,
+        convention=first.setting.world.convention,
         sequences=names,
         means={name: found[name] for name in numbers},
         repeated={name: np.concatenate(parts) for name, parts in repeated.items()},
@@ -207,18 +207,18 @@ def _rows(
     }
     offline = {f"offline_{m}": _mean(scores.once[f"offline_{m}"]) for m in METRICS}
     frames = scores.once["world_frames"]
-    for s, sigma in enumerate(setting.sigmas):
+    for s, sigma in enumerate(setting.world.sigmas):
         at = {metric: scores.means[metric][:, s] for metric in METRICS}
         row: Row = {**told, "sigma": str(sigma), **{m: _mean(v) for m, v in at.items()}, **offline}
         if s == 0:
             row |= _uncertain(scores, hold, "repeated", seed, resamples, counts)
         row |= _stale(scores, s, sigma, clock, frames)
         yield row
-    if set(SIGMA_GRID) <= set(setting.sigmas):
-        grid = [s for s, sigma in enumerate(setting.sigmas) if sigma in SIGMA_GRID]
+    if set(SIGMA_GRID) <= set(setting.world.sigmas):
+        grid = [s for s, sigma in enumerate(setting.world.sigmas) if sigma in SIGMA_GRID]
         means = {m: _mean_of_means(scores.means[m][:, grid]) for m in METRICS}
         row = {**told, "sigma": MEAN, **means, **offline}
-        if len(grid) == len(setting.sigmas):
+        if len(grid) == len(setting.world.sigmas):
             row |= _uncertain(scores, hold, "over_sigmas", seed, resamples, counts)
         yield row
 
@@ -368,7 +368,7 @@ def compare_traces(
 
 def _pair(a: Scores, b: Scores, seed: int, resamples: int, counts: dict[int, Counts]) -> Row | None:
     """A against B; None if they have no sequences in common that count."""
-    whole = set(SIGMA_GRID) == set(a.setting.sigmas)
+    whole = set(SIGMA_GRID) == set(a.setting.world.sigmas)
     which = "over_sigmas" if whole else "repeated"
     both = sorted(set(a.sequences) & set(b.sequences))
     ours, theirs = (
@@ -395,10 +395,10 @@ def _pair(a: Scores, b: Scores, seed: int, resamples: int, counts: dict[int, Cou
         "policy": setting.policy,
         "fps": str(setting.fps),
         "latency": setting.latency,
-        "scale": str(setting.scale),
+        "scale": str(setting.world.scale),
         "convention": a.convention,
         "forecaster": a.forecaster,
-        "sigma": MEAN if whole else str(setting.sigmas[0]),
+        "sigma": MEAN if whole else str(setting.world.sigmas[0]),
         "a": setting.run,
         "b": b.setting.run,
         "sequences": count,
