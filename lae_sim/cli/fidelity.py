@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict
+from typing import Any
 
 from lae_sim.cli.options import exit_status, new_parser
-
-if TYPE_CHECKING:
-    from lae_sim.comparison.fidelity import Row
 
 PROGRAM = "lae-sim fidelity"
 
@@ -81,22 +79,26 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     import json
 
     from lae_sim import __version__
-    from lae_sim.comparison.fidelity import GROUP, compared, summarised
+    from lae_sim.comparison.fidelity import compare_closed_loops, summarise_closed_loops
 
-    closed_loops = dict.fromkeys(arguments.closed_loop)
-    rows = [row for path in closed_loops for row in compared(path, arguments)]
-    groups: dict[tuple[str, ...], list[Row]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[key] for key in GROUP), []).append(row)
-    summary = [dict(zip(GROUP, key)) | summarised(group) for key, group in groups.items()]
+    rows = compare_closed_loops(
+        arguments.trace,
+        arguments.closed_loop,
+        passes=arguments.strided,
+        forecasters=arguments.forecaster,
+        convention=arguments.convention,
+    )
+    summary = [asdict(each) for each in summarise_closed_loops(rows)]
+    sequences = [asdict(row) for row in rows]
     if arguments.json:
         head = {"format": "lae-fidelity", "version": "1.0", "lae_sim": __version__}
         settings = {"trace": arguments.trace, "strided": arguments.strided}
         settings["convention"] = arguments.convention
-        print(json.dumps({**head, **settings, "summary": summary, "sequences": rows}, indent=2))
+        document = {**head, **settings, "summary": summary, "sequences": sequences}
+        print(json.dumps(document, indent=2))
         return
     if arguments.per_sequence:
-        print(_table(rows, SEQUENCE_COLUMNS, left=4), end="\n\n")
+        print(_table(sequences, SEQUENCE_COLUMNS, left=4), end="\n\n")
     print(_table(summary, SUMMARY_COLUMNS, left=3), end="\n\n")
     print(
         f"AUC by convention {arguments.convention}; |d| is |replay - closed loop| of a sequence.\n"
@@ -104,7 +106,7 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     )
 
 
-def _table(rows: Sequence[Row], columns: Mapping[str, str], left: int) -> str:
+def _table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, str], left: int) -> str:
     """Rows as aligned text."""
     from lae_sim.report.table import table
 
