@@ -269,7 +269,7 @@ def by_attribute(
 
 
 def over_sigmas(table: pd.DataFrame) -> pd.DataFrame:
-    """The tidy table of the plain means over its permitted latencies: metrics mauc, mdp20, ...
+    """The tidy table of the plain means over permitted latencies: metrics mauc, mdp20, ...
 
     Over 0, 0.02, ..., 1 these are mAUC and mDP of Li et al., "PVT++", 2023. ``sigma`` is 0 in all.
     """
@@ -329,10 +329,10 @@ def _summary_rows(
         share, ends = None, None
         if hold is not None and offline is not None:
             won, lost = (float(scores[i].mean() - scores[hold].mean()) for i in (f, offline))
-            found = bootstrap.recover(
+            recovery = bootstrap.recover(
                 won, lost, means[f] - means[hold], means[offline] - means[hold]
             )
-            share, ends = found.share, found.interval
+            share, ends = recovery.share, recovery.interval
         row["recovered"] = math.nan if share is None else share
         row |= (ends or _UNKNOWN).columns("recovered")
         rows.append(row)

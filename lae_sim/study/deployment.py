@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -12,6 +11,7 @@ import numpy as np
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate_groups
 from lae_sim.evaluation.metrics import find_convention
+from lae_sim.files import text_digest
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.study.cells import Cell, replayed
 from lae_sim.study.records import Requirement
@@ -44,8 +44,7 @@ class Search:
     @property
     def key(self) -> str:
         """Digest of all that the answer depends on."""
-        document = f"{self.cell.key} {self.required} {STEP} {MOST}"
-        return hashlib.sha256(document.encode()).hexdigest()[:32]
+        return text_digest(f"{self.cell.key} {self.required} {STEP} {MOST}")
 
 
 def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
@@ -65,7 +64,7 @@ def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
 
 @dataclass(frozen=True)
 class Slowest:
-    """What a search found.
+    """The answer to a search.
 
     Attributes:
         auc_without_latency: the mean AUC at scale 0.
@@ -128,7 +127,7 @@ def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
     return float(np.nanmean(scores))
 
 
-def requirement(search: Search, found: Slowest) -> Requirement:
+def requirement(search: Search, answer: Slowest) -> Requirement:
     """What the required AUC asks for.
 
     Where no time is absolute, as a cost or an expected time of a policy is, a schedule depends on
@@ -136,7 +135,7 @@ def requirement(search: Search, found: Slowest) -> Requirement:
     the recorded motion from frame to frame (but for the rounding to whole ns).
     """
     setting = search.cell.setting
-    scale, beyond = (None if x is None else Fraction(x) for x in (found.scale, found.beyond))
+    scale, beyond = (None if x is None else Fraction(x) for x in (answer.scale, answer.beyond))
     relative = search.cell.cost_ns == 0 and setting.policy.split(":")[0] in _RELATIVE
     return Requirement(
         trace=setting.trace.label,
@@ -149,10 +148,10 @@ def requirement(search: Search, found: Slowest) -> Requirement:
         sigma=setting.sigmas[0],
         required_auc=float(search.required),
         scale=scale,
-        auc=found.auc,
+        auc=answer.auc,
         beyond=beyond,
-        beyond_auc=found.beyond_auc,
-        auc_without_latency=found.auc_without_latency,
+        beyond_auc=answer.beyond_auc,
+        auc_without_latency=answer.auc_without_latency,
         speed_up=None if not scale else float(1 / scale),
         fps_at_most=float(scale * setting.fps) if scale is not None and relative else None,
     )

@@ -5,9 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -19,7 +18,7 @@ from lae_sim.files import written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.study.cells import Task
 from lae_sim.study.deployment import Slowest, requirement, searches
-from lae_sim.study.executors import cluster_executor, local_executor, run_all
+from lae_sim.study.executors import cores, run_all
 from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class StudyResults:
-    """What a study found.
+    """The results of a study.
 
     Attributes:
         folder: where it is kept.
@@ -154,21 +153,22 @@ def _run(
         *(replace(search, factory=factories[search.cell.forecaster]) for search in sought),
     ]
     failures, computed = [], 0
-    count = min(workers or _cores(), max(len(works), 1))
-    with _executor(count, scheduler) as (executor, size):
-        for done, (work, result) in enumerate(run_all(attempt, works, executor, size)):
-            progress("", done + 1, len(works))
+    workers = min(workers or cores(), max(len(works), 1))
+    # closed whatever happens here, or workers would outlive the study
+    with closing(run_all(attempt, works, workers, scheduler)) as attempts:
+        for done, (work, result) in enumerate(attempts, 1):
+            progress("", done, len(works))
             if isinstance(result, Failure):
                 failures.append(result)
-            elif not isinstance(work, Task):
-                store.keep(work.key, result)
-            else:
+            elif isinstance(work, Task):
                 for of_cell in result:
                     if isinstance(of_cell, Failure):
                         failures.append(of_cell)
                     else:
                         store.put(of_cell)
                         computed += 1
+            else:
+                store.keep(work.key, result)
     progress("summing up", len(works), len(works))
     scores = tuple(read_scores(plan, store))
     if not scores:
@@ -204,25 +204,6 @@ def _factories(
     factories, notes = plan.trained(progress)
     store.keep(key, {"notes": notes})
     return factories, notes
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextmanager
-def _executor(
-    workers: int, scheduler: str | None
-) -> Iterator[tuple[Executor | None, Callable[[], int]]]:
-    if scheduler is not None:
-        with cluster_executor(scheduler) as found:
-            yield found
-    elif workers == 1:
-        yield None, lambda: 1
-    else:
-        with local_executor(workers) as executor:
-            yield executor, lambda: workers
 
 
 def _write(results: StudyResults) -> None:

@@ -1,8 +1,8 @@
 """The summary of a study: means with intervals, what latency costs, how stale answers are.
 
-Two things are uncertain, and told apart. *Sequences*: 95 % percentile bootstrap over them, of the
+Two things are uncertain, and kept apart. *Sequences*: 95 % percentile bootstrap over them, of the
 scores averaged over the repetitions; *jitter*: the range that holds 95 % of the repetitions' means,
-for these very sequences. Resamples depend on the seed and the number of sequences alone.
+for these very sequences.
 """
 
 from __future__ import annotations
@@ -61,15 +61,6 @@ class Scores:
     about: tuple[Mapping[str, Any], ...]
 
     @property
-    def identity(self) -> tuple[Any, ...]:
-        """What a forecaster and hold share: the group, the trace and where its times are from."""
-        return (self.setting.trace, self.setting.timing, *self.group)
-
-    def runs(self, over_sigmas: bool) -> Mapping[str, Floats]:
-        """AUC and DP of each repetition and sequence, [R, S]: means over sigma, or at the first."""
-        return self.over_sigmas if over_sigmas else self.repeated
-
-    @property
     def group(self) -> tuple[str, ...]:
         """What scores must share to be compared: dataset, world, latency, convention."""
         setting = self.setting
@@ -81,6 +72,15 @@ class Scores:
             str(setting.scale),
             self.convention,
         )
+
+    @property
+    def identity(self) -> tuple[Any, ...]:
+        """What a forecaster and hold share: the group, the trace and where its times are from."""
+        return (self.setting.trace, self.setting.timing, *self.group)
+
+    def by_repetition(self, over_sigmas: bool) -> Mapping[str, Floats]:
+        """AUC and DP, float64 [R, S]: plain means over sigma, or at the first."""
+        return self.over_sigmas if over_sigmas else self.repeated
 
 
 _WORST = {"mismatch_max", "longest_hold"}
@@ -106,7 +106,7 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
     first = cells[0]
     count = len(first.setting.sigmas)
     numbers = [*METRICS, *_STALENESS]
-    found: dict[str, Any] = {}
+    totals: dict[str, Any] = {}
     repeated: dict[str, list[Floats]] = {name: [] for name in _REPEATED}
     over_sigmas: dict[str, list[Floats]] = {name: [] for name in ("auc", "dp20")}
     names: tuple[str, ...] = ()
@@ -119,11 +119,11 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
 
         entries = rows.num_rows // count
         sequences = rows.column("sequence").chunk(0)  # its take would import pyarrow.compute
-        told = [sequences[row].as_py() for row in range(0, rows.num_rows, count)]
-        names = tuple(sorted(set(told)))
+        of_entry = [sequences[row].as_py() for row in range(0, rows.num_rows, count)]
+        names = tuple(sorted(set(of_entry)))
         place = {name: s for s, name in enumerate(names)}
         order = np.lexsort((  # by repetition, then by sequence
-            np.array([place[name] for name in told]), column("repetition")[::count],
+            np.array([place[name] for name in of_entry]), column("repetition")[::count],
         ))  # fmt: skip
         shape = (cell.setting.count, len(names), count)
         for name in dict.fromkeys([*numbers, *_REPEATED, *_ONCE]):
@@ -134,22 +134,22 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
                 over_sigmas[name].append(values.mean(axis=2))
             values = values[:, :, 0] if name in _ONCE else values
             # one after another from the first repetition on, however they were dealt out
-            before = [found[name][None]] if name in found else []
+            before = [totals[name][None]] if name in totals else []
             combine = np.maximum if name in _WORST else np.add
-            found[name] = combine.reduce(np.concatenate([*before, values]))
+            totals[name] = combine.reduce(np.concatenate([*before, values]))
     count = sum(cell.setting.count for cell in cells)
-    for name in found.keys() - _WORST:
-        found[name] = found[name] / count
+    for name in totals.keys() - _WORST:
+        totals[name] = totals[name] / count
     return Scores(
         source=source,
         setting=first.setting,
         forecaster=first.forecaster,
         convention=first.convention,
         sequences=names,
-        means={name: found[name] for name in numbers},
+        means={name: totals[name] for name in numbers},
         repeated={name: np.concatenate(parts) for name, parts in repeated.items()},
         over_sigmas={name: np.concatenate(parts) for name, parts in over_sigmas.items()},
-        once={name: found[name] for name in _ONCE},
+        once={name: totals[name] for name in _ONCE},
         about=tuple(store.about(cell) for cell in cells),
     )
 
@@ -233,10 +233,10 @@ def _uncertainty(
     scores: Scores, hold: Scores | None, bootstrap: Bootstrap, over_sigmas: bool
 ) -> dict[str, Uncertainty]:
     """How sure mean AUC and DP are, and what is won over hold."""
-    found = {}
+    uncertain = {}
     for metric in ("auc", "dp20"):
-        values = scores.runs(over_sigmas)[metric]
-        base = None if hold is None or hold is scores else hold.runs(over_sigmas)[metric]
+        values = scores.by_repetition(over_sigmas)[metric]
+        base = None if hold is None or hold is scores else hold.by_repetition(over_sigmas)[metric]
         kept = ~np.isnan(values.mean(axis=0))
         if base is not None:
             kept &= ~np.isnan(base.mean(axis=0))
@@ -246,7 +246,7 @@ def _uncertainty(
         jitter = bootstrap.interval(values[:, kept].mean(axis=1)) if len(values) > 1 else None
         if base is None:
             [means] = bootstrap.means(mean[None])
-            found[metric] = Uncertainty(bootstrap.interval(means), jitter)
+            uncertain[metric] = Uncertainty(bootstrap.interval(means), jitter)
             continue
         bare, offline = base[:, kept].mean(axis=0), scores.once[f"offline_{metric}"][kept]
         means, held, losses = bootstrap.means(np.stack([mean, bare, offline - bare]))
@@ -254,8 +254,8 @@ def _uncertainty(
         if not np.isnan(offline).any():
             lost = float(offline.mean() - bare.mean())
             share = bootstrap.recover(difference.value, lost, means - held, losses)
-        found[metric] = Uncertainty(bootstrap.interval(means), jitter, difference, share)
-    return found
+        uncertain[metric] = Uncertainty(bootstrap.interval(means), jitter, difference, share)
+    return uncertain
 
 
 def _staleness(scores: Scores, s: int) -> Staleness:
@@ -264,19 +264,19 @@ def _staleness(scores: Scores, s: int) -> Staleness:
     frames, frame_ms = scores.once["world_frames"], clock.milliseconds(1)
     mismatch = scores.means["mismatch_mean"][:, s] * frames
     mean = float(mismatch.sum() / frames.sum())
-    found = Staleness(
+    staleness = Staleness(
         mismatch_mean=mean,
         age_ms=(mean + float(sigma)) * frame_ms,
         age_max_ms=float(scores.means["mismatch_max"][:, s].max() + sigma) * frame_ms,
         longest_stale_ms=float(scores.means["longest_hold"][:, s].max()) * frame_ms,
     )
     if s:
-        return found
+        return staleness
     failure = scores.repeated["failure_frame"]
     failed = failure < frames
     median = _median_survival(failure.ravel(), failed.ravel())
     return replace(
-        found,
+        staleness,
         failed=float(failed.mean()),
         time_to_failure_ms=None if median is None else median * frame_ms,
     )
@@ -286,8 +286,8 @@ def _median_survival(times: Floats, failed: Bools) -> float | None:
     """Median time to failure, in the unit of the times; None if less than half fail.
 
     Sequences that end without failure are censored: the estimate is that of Kaplan and Meier,
-    "Nonparametric Estimation from Incomplete Observations", 1958. It is exact, so that "half"
-    is half.
+    "Nonparametric Estimation from Incomplete Observations", 1958. In exact numbers, for in floats
+    (as scipy.stats.ecdf has it) half of them may not be half.
     """
     alive = Fraction(1)
     for time in np.unique(times[failed]):
@@ -345,13 +345,13 @@ def compare_traces(
     together: dict[tuple[str, ...], list[Scores]] = {}
     for each in scores:
         together.setdefault((*each.group, each.forecaster), []).append(each)
-    found = []
+    comparisons = []
     for group in together.values():
         pairs = [_pair(a, b, bootstrap) for a, b in combinations(group, 2)]
         known = [pair for pair in pairs if pair is not None]
         corrected = holm([pair.difference.p for pair in known])
-        found += [replace(pair, p_holm=p) for pair, p in zip(known, corrected)]
-    return found
+        comparisons += [replace(pair, p_holm=p) for pair, p in zip(known, corrected)]
+    return comparisons
 
 
 def _pair(a: Scores, b: Scores, bootstrap: Bootstrap) -> Comparison | None:
@@ -360,7 +360,8 @@ def _pair(a: Scores, b: Scores, bootstrap: Bootstrap) -> Comparison | None:
     whole = set(SIGMA_GRID) == set(setting.sigmas)
     both = sorted(set(a.sequences) & set(b.sequences))
     first, second = (
-        one.runs(whole)["auc"][:, [one.sequences.index(name) for name in both]] for one in (a, b)
+        one.by_repetition(whole)["auc"][:, [one.sequences.index(name) for name in both]]
+        for one in (a, b)
     )
     kept = ~np.isnan(first.mean(axis=0) + second.mean(axis=0))
     if not kept.any():

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
 from lae_sim import __version__
 from lae_sim.errors import LaeError, explained
+from lae_sim.files import text_digest
 from lae_sim.study.cells import Cell, Input, Result, Setting, Task, compute
 from lae_sim.study.deployment import Search, slowest
 from lae_sim.study.records import Failure
@@ -29,8 +29,7 @@ class Description:
     @property
     def key(self) -> str:
         """Digest of all that the description depends on."""
-        document = repr((__version__, self.trace.label, self.trace.digest, self.sequences))
-        return hashlib.sha256(document.encode()).hexdigest()[:32]
+        return text_digest(repr((__version__, self.trace.label, self.trace.digest, self.sequences)))
 
 
 Work: TypeAlias = Description | Task | Search
