@@ -62,7 +62,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from lae_sim import __version__
-    from lae_sim.cli.options import parse_world
+    from lae_sim.cli.options import worlds_of
     from lae_sim.forecast.learned import Learned, write_learned
     from lae_sim.learning.folds import Examples
     from lae_sim.learning.trainers import NetworkTrainer
@@ -72,10 +72,10 @@ def _train(arguments: argparse.Namespace) -> None:
     arguments.traces = find_traces(arguments.traces)
     check_distinct([arguments.out], arguments.traces)
     check_folders([arguments.out])
-    world = parse_world(arguments)
+    worlds = worlds_of(arguments)
     traces = [read_trace(path, arguments.sequence) for path in arguments.traces]
     examples = Examples.joined(
-        [Examples.of(runs) for trace in traces for *_, runs in world.replays(trace)]
+        [Examples.of(list(world.replay(trace))) for trace in traces for world in worlds]
     )
     absent = sorted(set(arguments.exclude) - set(examples.sequences))
     if absent:

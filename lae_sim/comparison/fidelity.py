@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.errors import LaeError
@@ -28,9 +27,10 @@ def compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
     """One closed loop against replays at its times: a row per forecaster, replay and sequence."""
     import numpy as np
 
+    from lae_sim.engine.clock import Clock
     from lae_sim.evaluation.evaluate import evaluate
     from lae_sim.evaluation.metrics import find_convention
-    from lae_sim.replay.run import replay_trace
+    from lae_sim.replay.run import Runs
     from lae_sim.trace.file import read_trace
 
     closed = read_trace(path)
@@ -53,11 +53,12 @@ def compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
     def scored(runs: list[Run]) -> Evaluation:
         return evaluate(runs, closed.metadata, forecasters, (Fraction(0),), convention)
 
-    replay = partial(replay_trace, every, closed.metadata.fps, policy=policy, timing=closed)
-    truth = list(replay_trace(closed, policy=policy))
-    replays = {"every-frame": list(replay())}
+    clock = Clock.at(closed.metadata.fps)
+    truth = list(Runs(closed, clock, policy=policy))
+    replays = {"every-frame": list(Runs(every, clock, policy=policy, timing=closed))}
     if strided:
-        replays["strided"] = list(replay(strided=strided))
+        passes = Runs(every, clock, policy=policy, timing=closed, passes=tuple(strided))
+        replays["strided"] = list(passes)
     reference = scored(truth)
     for kind, runs in replays.items():
         found = scored(runs)

@@ -14,7 +14,7 @@ from lae_sim.comparison.statistics import recovered
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.table import table
 from lae_sim.trace.metadata import Metadata
 

@@ -131,7 +131,7 @@ def row_of(scores: Scores) -> dict[str, Any]:
         "dataset": scores.source.metadata.dataset,
         "convention": scores.convention,
         "forecaster": scores.forecaster,
-        "sigma": str(scores.setting.sigmas[0]),
+        "sigma": str(scores.setting.world.sigmas[0]),
     }
 
 

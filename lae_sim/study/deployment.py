@@ -51,9 +51,9 @@ def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
     """One search for all cells that differ in their scale or repetitions alone."""
     counts: dict[Cell, int] = {}
     for cell in cells:
-        setting = replace(
-            cell.setting, scale=Fraction(1), first=0, count=1, sigmas=cell.setting.sigmas[:1]
-        )
+        world = cell.setting.world
+        world = replace(world, scale=Fraction(1), sigmas=world.sigmas[:1])
+        setting = replace(cell.setting, world=world, first=0, count=1)
         alike = replace(cell, setting=setting)
         counts[alike] = max(counts.get(alike, 1), cell.setting.first + cell.setting.count)
     return [
@@ -112,13 +112,13 @@ def slowest(search: Search) -> Slowest:
 def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
     """The mean AUC over sequences and repetitions at a scale of all times."""
     cell = search.cell
-    setting = replace(cell.setting, scale=scale)
+    setting = replace(cell.setting, world=replace(cell.setting.world, scale=scale))
     parts = evaluate_groups(
         (run for _, run in replayed(setting, trace).runs),
         trace.metadata,
         {cell.forecaster: search.factory},
-        setting.sigmas,
-        find_convention(cell.convention),
+        setting.world.sigmas,
+        find_convention(cell.setting.world.convention),
         costs={cell.forecaster: cell.cost_ns},
     )
     scores = np.concatenate([part.scores["auc"][0, :, 0] for part in parts])
@@ -143,9 +143,9 @@ def requirement(search: Search, answer: Slowest) -> Requirement:
         policy=setting.policy,
         fps=setting.fps,
         latency=setting.latency,
-        convention=search.cell.convention,
+        convention=setting.world.convention,
         forecaster=search.cell.forecaster,
-        sigma=setting.sigmas[0],
+        sigma=setting.world.sigmas[0],
         required_auc=float(search.required),
         scale=scale,
         auc=answer.auc,

@@ -19,7 +19,7 @@ from lae_sim._arrays import Bools, Floats
 from lae_sim.comparison.statistics import RESAMPLES, Bootstrap, holm
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.cells import Cell, Setting
 from lae_sim.study.plan import Plan, Source
 from lae_sim.study.records import MEAN as MEAN
@@ -38,7 +38,7 @@ class Scores:
     Attributes:
         source: the trace.
         setting: the first of the settings, which differ in their repetitions.
-        forecaster, convention: names.
+        forecaster: its name.
         sequences: names, S of them.
         means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``;
             of ``mismatch_max`` and ``longest_hold`` the largest (frames).
@@ -52,13 +52,17 @@ class Scores:
     source: Source
     setting: Setting
     forecaster: str
-    convention: str
     sequences: tuple[str, ...]
     means: Mapping[str, Floats]
     repeated: Mapping[str, Floats]
     over_sigmas: Mapping[str, Floats]
     once: Mapping[str, Floats]
     about: tuple[Mapping[str, Any], ...]
+
+    @property
+    def convention(self) -> str:
+        """How frames and thresholds count."""
+        return self.setting.world.convention
 
     @property
     def group(self) -> tuple[str, ...]:
@@ -69,7 +73,7 @@ class Scores:
             setting.policy,
             str(setting.fps),
             setting.latency,
-            str(setting.scale),
+            str(setting.world.scale),
             self.convention,
         )
 
@@ -92,10 +96,10 @@ _ONCE = ("world_frames", "processed", "elapsed_ms", *(f"offline_{m}" for m in ME
 def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
     """The finished cells of a study, in the order of the plan; one after another."""
     sources = {source.input: source for source in plan.sources}
-    together: dict[tuple[Any, ...], list[Cell]] = {}
+    together: dict[tuple[Setting, str], list[Cell]] = {}
     for cell in plan.cells:
         same = replace(cell.setting, first=0, count=1)
-        together.setdefault((same, cell.forecaster, cell.convention), []).append(cell)
+        together.setdefault((same, cell.forecaster), []).append(cell)
     for cells in together.values():
         if all(store.has(cell) for cell in cells):
             yield _read(cells, sources[cells[0].setting.trace], store)
@@ -104,7 +108,7 @@ def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
 def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
     """The scores of cells that differ in their repetitions alone."""
     first = cells[0]
-    count = len(first.setting.sigmas)
+    count = len(first.setting.world.sigmas)
     numbers = [*METRICS, *_STALENESS]
     totals: dict[str, Any] = {}
     repeated: dict[str, list[Floats]] = {name: [] for name in _REPEATED}
@@ -144,7 +148,6 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
         source=source,
         setting=first.setting,
         forecaster=first.forecaster,
-        convention=first.convention,
         sequences=names,
         means={name: totals[name] for name in numbers},
         repeated={name: np.concatenate(parts) for name, parts in repeated.items()},
@@ -184,7 +187,7 @@ def summarise_study(
 
 
 def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator[SummaryRow]:
-    setting, metadata, sigmas = scores.setting, scores.source.metadata, scores.setting.sigmas
+    setting, metadata, sigmas = scores.setting, scores.source.metadata, scores.setting.world.sigmas
     departures = sum(about["approximate_outputs"] for about in scores.about)
     calls = sum(about["calls"] for about in scores.about)
     frames = scores.once["world_frames"]
@@ -197,7 +200,7 @@ def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator
         policy=setting.policy,
         fps=setting.fps,
         latency=setting.latency,
-        scale=setting.scale,
+        scale=setting.world.scale,
         convention=scores.convention,
         forecaster=scores.forecaster,
         sequences=len(scores.sequences),
@@ -260,7 +263,7 @@ def _uncertainty(
 
 def _staleness(scores: Scores, s: int) -> Staleness:
     """How old answers are, and how long the target is held, in world time, at one sigma."""
-    sigma, clock = scores.setting.sigmas[s], Clock.at(scores.setting.fps)
+    sigma, clock = scores.setting.world.sigmas[s], Clock.at(scores.setting.fps)
     frames, frame_ms = scores.once["world_frames"], clock.milliseconds(1)
     mismatch = scores.means["mismatch_mean"][:, s] * frames
     mean = float(mismatch.sum() / frames.sum())
@@ -357,7 +360,7 @@ def compare_traces(
 def _pair(a: Scores, b: Scores, bootstrap: Bootstrap) -> Comparison | None:
     """A against B; None if they have no sequences in common that count."""
     setting = a.setting
-    whole = set(SIGMA_GRID) == set(setting.sigmas)
+    whole = set(SIGMA_GRID) == set(setting.world.sigmas)
     both = sorted(set(a.sequences) & set(b.sequences))
     first, second = (
         one.by_repetition(whole)["auc"][:, [one.sequences.index(name) for name in both]]
@@ -379,10 +382,10 @@ def _pair(a: Scores, b: Scores, bootstrap: Bootstrap) -> Comparison | None:
         policy=setting.policy,
         fps=setting.fps,
         latency=setting.latency,
-        scale=setting.scale,
+        scale=setting.world.scale,
         convention=a.convention,
         forecaster=a.forecaster,
-        sigma=MEAN if whole else setting.sigmas[0],
+        sigma=MEAN if whole else setting.world.sigmas[0],
         a=setting.run,
         b=b.setting.run,
         sequences=len(differences),

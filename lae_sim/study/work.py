@@ -105,10 +105,10 @@ def work_in_words(work: Work) -> str:
 
 
 def _in_words(setting: Setting, scale: bool = True) -> str:
-    factor = f" x {setting.scale}" if scale and setting.scale != 1 else ""
+    factor = f" x {setting.world.scale}" if scale and setting.world.scale != 1 else ""
     return f"{setting.run}, {setting.policy}, {setting.fps} fps, {setting.latency}{factor}"
 
 
 def cell_in_words(cell: Cell) -> str:
     """What a cell is about, in words."""
-    return f"{_in_words(cell.setting)}, {cell.forecaster}, {cell.convention}"
+    return f"{_in_words(cell.setting)}, {cell.forecaster}, {cell.setting.world.convention}"

@@ -11,7 +11,7 @@ import pytest
 from places import REPOSITORY
 
 from lae_sim.comparison.statistics import Difference, Interval, Recovered
-from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.records import Failure, Staleness, SummaryRow, Uncertainty
 from lae_sim.study.run import run_study, write_csv
 from lae_sim.study.spec import Study
