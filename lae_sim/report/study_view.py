@@ -124,7 +124,7 @@ class View:
                 yield {**row, "sequence": scores.sequences[s], "value": float(aucs[s])}
 
 
-def row_of(scores: Scores) -> Row:
+def row_of(scores: Scores) -> dict[str, Any]:
     """What says which scores these are, as the rows of the summary say it."""
     return {
         **scores.setting.columns(),
