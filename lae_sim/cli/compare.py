@@ -195,7 +195,7 @@ def _tell(
 
     from lae_sim import __version__
     from lae_sim.comparison.statistics import by_attribute, over_sigmas, summarise
-    from lae_sim.report.forecasters import comparison_table
+    from lae_sim.report.comparison import comparison_table
 
     metrics, notes = ("auc", "dp20"), table.attrs["notes"]
     if arguments.sigma_grid:

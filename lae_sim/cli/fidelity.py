@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli.options import exit_status, new_parser
@@ -12,35 +12,6 @@ if TYPE_CHECKING:
     from lae_sim.comparison.fidelity import Row
 
 PROGRAM = "lae-sim fidelity"
-
-SUMMARY_COLUMNS = {
-    "closed_loop": "closed loop",
-    "forecaster": "forecaster",
-    "replay": "replay",
-    "sequences": "sequences",
-    "closed_auc": "closed AUC",
-    "auc": "AUC",
-    "mean_abs_d_auc": "mean |d|",
-    "median_abs_d_auc": "median",
-    "max_abs_d_auc": "max",
-    "closed_dp20": "closed DP",
-    "dp20": "DP",
-    "mean_abs_d_dp20": "mean |d|",
-}
-SEQUENCE_COLUMNS = {
-    "closed_loop": "closed loop",
-    "forecaster": "forecaster",
-    "replay": "replay",
-    "sequence": "sequence",
-    "closed_auc": "closed AUC",
-    "auc": "AUC",
-    "d_auc": "d",
-    "closed_dp20": "closed DP",
-    "dp20": "DP",
-    "d_dp20": "d",
-    "parted": "parted at",
-    "disagreement": "disagree",
-}
 
 DESCRIPTION = """\
 Compare replays of a trace of every frame with closed loops, in which the tracker really skipped
@@ -95,26 +66,12 @@ def _fidelity(arguments: argparse.Namespace) -> None:
         settings["convention"] = arguments.convention
         print(json.dumps({**head, **settings, "summary": summary, "sequences": rows}, indent=2))
         return
+    from lae_sim.report.comparison import fidelity_table
+
     if arguments.per_sequence:
-        print(_table(rows, SEQUENCE_COLUMNS, left=4), end="\n\n")
-    print(_table(summary, SUMMARY_COLUMNS, left=3), end="\n\n")
+        print(fidelity_table(rows), end="\n\n")
+    print(fidelity_table(summary), end="\n\n")
     print(
         f"AUC by convention {arguments.convention}; |d| is |replay - closed loop| of a sequence.\n"
         "every-frame: boxes of TRACE; strided: of the pass nearest to the frames skipped."
     )
-
-
-def _table(rows: Sequence[Row], columns: Mapping[str, str], left: int) -> str:
-    """Rows as aligned text."""
-    from lae_sim.report.table import table
-
-    lines = [[_text(row[key], key.startswith("d_")) for key in columns] for row in rows]
-    return table(list(columns.values()), lines, left=left)
-
-
-def _text(value: object, signed: bool) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, float):
-        return f"{value:+.3f}" if signed else f"{value:.3f}"
-    return str(value)

@@ -369,16 +369,9 @@ def _settings(arguments: argparse.Namespace, tracker: TimedTracker) -> dict[str,
 def _print_summary(reports: Sequence[Mapping[str, Any]]) -> None:
     import shlex
 
-    from lae_sim.report.table import table
+    from lae_sim.report.trace import profile_table
 
-    header = ["trace", "sequences", "frames", "processed", "lost", "init ms", "median ms", "p95 ms"]
-    lines = [
-        [r["trace"]]
-        + [f"{r[key]:,}" for key in ("sequences", "world_frames", "processed", "lost")]
-        + ["-" if r[key] is None else f"{r[key]:.2f}" for key in ("init_ms", "median_ms", "p95_ms")]
-        for r in reports
-    ]
-    print(table(header, lines, left=1))
+    print(profile_table(reports))
     first, *others = (shlex.quote(r["trace"]) for r in reports)
     kinds = [r["schedule"]["kind"] for r in reports]
     strided = [t for t, r in zip(others, reports[1:]) if "stride" in r["schedule"]]

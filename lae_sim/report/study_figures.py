@@ -19,7 +19,7 @@ from lae_sim.comparison.statistics import ALL_TRACES
 from lae_sim.engine.clock import parse_duration
 from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS
 from lae_sim.report.figures import new_figure
-from lae_sim.report.study_view import SETTINGS, View, row_of, run_of, setting_of, told_setting
+from lae_sim.report.study_view import SETTINGS, View, row_of, run_of, setting_of, shared_setting
 from lae_sim.report.table import printable
 from lae_sim.study.summary import MEAN, Row, Scores
 
@@ -127,7 +127,7 @@ def curves(view: View) -> Iterator[Picture]:
     )
     for group in ordered[:MOST_PAIRS]:
         rows, told = _best(view, [{**row_of(s), "auc": _mean(s), "scores": s} for s in group])
-        what = f"{printable(rows[0]['dataset'])}: {told_setting(rows)}{told}"
+        what = f"{printable(rows[0]['dataset'])}: {shared_setting(rows)}{told}"
         yield drawn(
             f"{what}. In brackets: AUC, and precision at 20 px.",
             lambda rows=rows: _curves(view, rows),  # type: ignore[misc]
@@ -192,7 +192,10 @@ def sweep(view: View, key: str) -> Picture | None:
     if len({row["x"] for row in points}) < 2:
         return None
     datasets = list(dict.fromkeys(row["dataset"] for row in points))
-    kept, caption = [], f"Over {SWEEPS[key].split(' (')[0]}: {told_setting(view.standing, but=key)}"
+    kept, caption = (
+        [],
+        f"Over {SWEEPS[key].split(' (')[0]}: {shared_setting(view.standing, but=key)}",
+    )
     for dataset in datasets:
         best, told = _best(view, [row for row in points if row["dataset"] == dataset])
         kept += best
@@ -242,7 +245,7 @@ def front(view: View) -> Picture | None:
     if not rows:
         return None
     caption = "AUC against the mean time of a call; hollow: hold; lines join what no other tracker"
-    return drawn(f"{caption} beats in both: {told_setting(rows)}", lambda: _front(view, rows))
+    return drawn(f"{caption} beats in both: {shared_setting(rows)}", lambda: _front(view, rows))
 
 
 def _front(view: View, rows: Sequence[Row]) -> Figure:
@@ -303,7 +306,7 @@ def gains(view: View) -> Picture | None:
     told = f", the {len(kept)} largest of {len(best)}" if len(kept) < len(best) else ""
     caption = f"What forecasters win over hold{told}, with 95 % intervals over sequences"
     rows = [row for row in rows if run_of(row) in kept]
-    return drawn(f"{caption}: {told_setting(rows)}", lambda: _gains(view, rows, kept))
+    return drawn(f"{caption}: {shared_setting(rows)}", lambda: _gains(view, rows, kept))
 
 
 def _gains(view: View, rows: Sequence[Row], runs: Sequence[str]) -> Figure:

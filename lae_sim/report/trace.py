@@ -7,10 +7,12 @@ import re
 import shutil
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.report.table import table
+from lae_sim.report.table import COUNT, Column, Number, Table, text_of
 from lae_sim.trace.describe import Report, gathered
 
 if TYPE_CHECKING:
@@ -104,12 +106,15 @@ def _readings(device: Any) -> list[str]:
     """Clocks, temperatures and load before, during and after; nothing where there are none."""
     # another program may have written anything there
     found = gathered(taken=lambda: dict(device["readings"])).get("taken", {})
-    rows = []
-    for name, figure in _FIGURES.items():
-        cells = [_range(found.get(when), figure) for when in ("before", "during", "after")]
-        rows += [[name, *cells]] if any(cells) else []
-    header = ["readings", "before", "during", "after"]
-    return ["", *table(header, rows, left=1).splitlines()] if rows else []
+
+    def reading(when: str) -> Column:
+        return Column(when, lambda row: _range(found.get(when), row[1]))
+
+    columns = [Column("readings", itemgetter(0), is_label=True)]
+    columns += map(reading, ("before", "during", "after"))
+    table = Table.of(columns, _FIGURES.items())
+    table = replace(table, rows=tuple(row for row in table.rows if any(c.text for c in row[1:])))
+    return ["", *text_of(table).splitlines()] if table.rows else []
 
 
 def _range(taken: Any, figure: Callable[[Any], float]) -> str:
@@ -122,21 +127,23 @@ def _range(taken: Any, figure: Callable[[Any], float]) -> str:
 
 def _times(times: Mapping[str, Any]) -> list[str]:
     names = ("mean_ms", "median_ms", "p90_ms", "p95_ms", "p99_ms", "max_ms", "fps")
-    rows = [
-        [kind, f"{found['n']:,}", *(_figure(found.get(name)) for name in names)]
-        for kind in ("calls", "initialisations")
-        if (found := times[kind])["n"]
+
+    def figure(name: str) -> Column:
+        return Column(name.removesuffix("_ms"), lambda kind: times[kind].get(name), _figure)
+
+    columns = [
+        Column("times, ms", str, is_label=True),
+        Column("n", lambda kind: times[kind]["n"], COUNT),
+        *map(figure, names),
     ]
-    header = ["times, ms", "n", *(name.removesuffix("_ms") for name in names)]
+    kinds = [kind for kind in ("calls", "initialisations") if times[kind]["n"]]
     share, interval = 100 * times["slower_than_frames"], _figure(times["frame_interval_ms"])
     late = f"{share:.3g}% of the calls take longer than the interval between frames, {interval} ms"
-    return [*table(header, rows, left=1).splitlines(), late]
+    return [*text_of(Table.of(columns, kinds)).splitlines(), late]
 
 
-def _figure(value: float | None) -> str:
+def _figure(value: float) -> str:
     """Three digits, or all before the point."""
-    if value is None:
-        return "-"
     return f"{value:,.{max(0, min(3, 2 - math.floor(math.log10(abs(value) or 1))))}f}"
 
 
@@ -179,6 +186,20 @@ def _stalls(stalls: list[dict[str, Any]]) -> list[str]:
         first = sum(stall["first_call"] for stall in left)
         lines.append(f"{'...':>10}     and {len(left):,} more, {first:,} of them first calls")
     return [*lines, ""]
+
+
+def profile_table(reports: Sequence[Mapping[str, Any]]) -> str:
+    """What a profile's passes left: a line per trace."""
+    columns = [Column("trace", itemgetter("trace"), is_label=True)]
+    counts = {"sequences": "sequences", "frames": "world_frames", "processed": "processed"}
+    columns += [
+        Column(title, itemgetter(key), COUNT) for title, key in {**counts, "lost": "lost"}.items()
+    ]
+    columns += [
+        Column(key.replace("_", " "), itemgetter(key), Number(".2f"))
+        for key in ("init_ms", "median_ms", "p95_ms")
+    ]
+    return text_of(Table.of(columns, reports))
 
 
 def plot_times(found: Sequence[tuple[Report, Sequence[SequenceTimes]]], path: str) -> None:

@@ -13,7 +13,7 @@ from tidy_scores import random_scores, tidy
 
 from lae_sim.comparison.statistics import by_attribute, signed_rank_p, summarise
 from lae_sim.errors import LaeError
-from lae_sim.report.forecasters import comparison_table
+from lae_sim.report.comparison import comparison_table
 from lae_sim.report.table import p_label, setting_label
 
 KEYS = ["trace", "latency", "scale", "sigma", "forecaster", "metric"]
