@@ -118,9 +118,10 @@ def _check(arguments: argparse.Namespace) -> None:
         from lae_sim.report.figures import check_format
 
         check_format(arguments.plot)
+    from lae_sim.engine.scheduler import scores_latency
     from lae_sim.replay.world import parse_policy
 
-    if parse_policy(arguments.policy)[1]:
+    if not scores_latency(parse_policy(arguments.policy)):
         raise LaeError("vot-realtime never scores latency: there is nothing to forecast")
     if "offline" in arguments.forecaster:
         raise LaeError("offline is always in the table: the tracker's own boxes, without latency")

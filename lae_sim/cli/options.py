@@ -198,5 +198,5 @@ def parse_world(arguments: argparse.Namespace) -> World:
         {name: parse_latency(name) for name in dict.fromkeys(arguments.latency)},
         list(dict.fromkeys(arguments.latency_scale)),
         arguments.fps,
-        parse_policy(arguments.policy)[0],
+        parse_policy(arguments.policy),
     )

@@ -289,7 +289,7 @@ def _passes(
     clock = Clock.at(dataset.fps)
     from lae_sim.replay.world import parse_policy
 
-    policy, _ = parse_policy(arguments.policy or "latest")
+    policy = parse_policy(arguments.policy or "latest")
     mode = arguments.mode or (
         "real-time" if arguments.policy or arguments.timing else "every-frame"
     )

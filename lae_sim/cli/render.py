@@ -83,7 +83,7 @@ def _render(arguments: argparse.Namespace) -> None:
     if not folder and kind not in (".mp4", ".png", ".jpg", ".jpeg"):
         raise LaeError(f"--out {out}: name a .mp4, .png or .jpg file, or a folder")
     check_distinct([out], [path for path in inputs if path])
-    metadata, runs, at_arrival = _replayed(arguments)
+    metadata, runs = _replayed(arguments)
     if not folder and len(runs) > 1:
         raise LaeError(
             f"{arguments.trace} has {len(runs)} sequences: choose one with --sequence, or give a "
@@ -94,7 +94,7 @@ def _render(arguments: argparse.Namespace) -> None:
     forecasters = {name: load_forecaster(name, camera) for name in arguments.forecaster}
     for run in runs:
         images = found[run.recording.name]
-        scene = Scene.of(run, images, metadata, forecasters, at_arrival)
+        scene = Scene.of(run, images, metadata, forecasters)
         if folder:
             out.mkdir(parents=True, exist_ok=True)
             name = run.recording.name.replace("/", "-")
@@ -106,20 +106,20 @@ def _render(arguments: argparse.Namespace) -> None:
             _sheet(scene, arguments.frames or sorted({last * k // 11 for k in range(12)}), out)
 
 
-def _replayed(arguments: argparse.Namespace) -> tuple[Metadata, list[Run], bool]:
-    """The trace's metadata, its replayed sequences, and whether outputs count at arrival."""
+def _replayed(arguments: argparse.Namespace) -> tuple[Metadata, list[Run]]:
+    """The metadata of the trace, and its sequences replayed."""
     from lae_sim.replay.latency import scaled
     from lae_sim.replay.run import replay_trace
     from lae_sim.replay.world import parse_latency, parse_policy
     from lae_sim.trace.file import read_trace
 
-    policy, at_arrival = parse_policy(arguments.policy)
+    policy = parse_policy(arguments.policy)
     source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
     trace = read_trace(arguments.trace, arguments.sequence)
     timing = read_trace(arguments.timing) if arguments.timing else None
     strided = [read_trace(path, arguments.sequence) for path in arguments.strided]
     runs = replay_trace(trace, arguments.fps, source, policy, timing, strided)
-    return trace.metadata, list(runs), at_arrival
+    return trace.metadata, list(runs)
 
 
 def _images(run: Run, metadata: Metadata, arguments: argparse.Namespace) -> ImageSequence:

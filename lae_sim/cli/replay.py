@@ -175,7 +175,7 @@ def _sinks(
     if arguments.schedule:
         sinks.append(files.enter_context(export.schedule_file(arguments.schedule, job.clock)))
     if arguments.events:
-        events = export.events_file(arguments.events, arguments.sigma[0], job.at_arrival)
+        events = export.events_file(arguments.events, arguments.sigma[0])
         sinks.append(files.enter_context(events))
     if arguments.timeline:
         costs = {name: job.costs.get(name, 0) for name in arguments.forecaster}
@@ -194,9 +194,7 @@ def _sinks(
             factory = job.forecasters[name]
             for sigma in arguments.sigma:
                 cost_ns = job.costs.get(name, 0)
-                found = answers(
-                    run, job.trace.metadata, name, factory, sigma, job.at_arrival, cost_ns
-                )
+                found = answers(run, job.trace.metadata, name, factory, sigma, cost_ns)
                 for sink in answer_sinks:
                     sink(run, name, sigma, found)
 
@@ -232,7 +230,6 @@ def _plot(
             job.forecasters,
             sigma,
             job.convention,
-            job.at_arrival,
             job.costs,
         )
         prefix = f"{Path(job.label).with_suffix('')}: " if several else ""
@@ -276,7 +273,6 @@ class Job:
         clock: the world's clock.
         scale: exact factor on all times.
         runs: replays the sequences, from the first, each time it is called.
-        at_arrival: whether outputs count from their own frames' arrival.
         forecasters: factories by name; hold, the baseline of all comparisons, is always there.
         costs: what an answer of each forecaster costs, ns.
         sigmas: permitted latencies, ascending.
@@ -290,7 +286,6 @@ class Job:
     clock: Clock
     scale: Fraction
     runs: Callable[[], Iterator[Run]]
-    at_arrival: bool
     forecasters: Mapping[str, AnyFactory]
     costs: Mapping[str, int]
     sigmas: Sequence[Fraction]
@@ -302,6 +297,7 @@ def jobs_of(
 ) -> Iterator[Job]:
     """The jobs of one trace: for each frame rate, one for each scale of the times."""
     from lae_sim.engine.clock import Clock
+    from lae_sim.engine.scheduler import scores_latency
     from lae_sim.evaluation.metrics import find_convention
     from lae_sim.forecast.costs import resolve_costs
     from lae_sim.replay.latency import scaled
@@ -309,7 +305,8 @@ def jobs_of(
     from lae_sim.replay.world import parse_latency, parse_policy
     from lae_sim.trace.file import read_trace
 
-    policy, at_arrival = parse_policy(arguments.policy)
+    policy = parse_policy(arguments.policy)
+    at_arrival = not scores_latency(policy)
     if at_arrival and any(sigmas):
         raise LaeError("vot-realtime never scores latency: it goes with no permitted latency")
     if at_arrival and arguments.cost:
@@ -341,7 +338,6 @@ def jobs_of(
                 clock=Clock.at(fps),
                 scale=scale,
                 runs=partial(replay_trace, trace, fps, source, policy, timing, strided),
-                at_arrival=at_arrival,
                 forecasters=forecasters,
                 costs=costs,
                 sigmas=sigmas,
@@ -363,11 +359,9 @@ def report(
     if arguments.latency == "recorded" and job.timing is None:
         sinks = [*sinks, stalls]
     runs = _written(_progress(job.runs(), job.path, job.trace.frames), sinks)
-    evaluation = evaluate(
-        runs, metadata, job.forecasters, job.sigmas, job.convention, job.at_arrival, job.costs
-    )
+    evaluation = evaluate(runs, metadata, job.forecasters, job.sigmas, job.convention, job.costs)
     members = attribute_members(metadata, evaluation.sequences)
-    notes = notes_on(evaluation, metadata, job.convention, job.forecasters, job.at_arrival)
+    notes = notes_on(evaluation, metadata, job.convention, job.forecasters)
     figures = trace_report(
         evaluation,
         job.clock,

@@ -46,12 +46,12 @@ def compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
         if trace.metadata.kind != "every-frame":
             raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
     schedule = closed.metadata.document["schedule"]
-    policy, at_arrival = parse_policy(schedule.get("policy", "latest"))
+    policy = parse_policy(schedule.get("policy", "latest"))
     forecasters = {name: load_forecaster(name) for name in arguments.forecaster}
     convention = find_convention(arguments.convention)
 
     def scored(runs: list[Run]) -> Evaluation:
-        return evaluate(runs, closed.metadata, forecasters, (Fraction(0),), convention, at_arrival)
+        return evaluate(runs, closed.metadata, forecasters, (Fraction(0),), convention)
 
     replay = partial(replay_trace, every, closed.metadata.fps, policy=policy, timing=closed)
     truth = list(replay_trace(closed, policy=policy))

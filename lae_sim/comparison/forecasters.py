@@ -81,7 +81,7 @@ def compare_forecasters(
             named = {"trace": label, "dataset": dataset, "latency": latency, "scale": float(scale)}
             tables.append(rows.assign(**named))
             notes += _notes(f"{label}, {setting}", found, priced)
-        about = notes_on(found, trace.metadata, convention, ready, at_arrival=False)
+        about = notes_on(found, trace.metadata, convention, ready)
         notes += [f"{label}: {note}" for note in about]
     return _joined(tables, notes)
 

@@ -16,7 +16,7 @@ import numpy as np
 from lae_sim._arrays import Ints
 from lae_sim.engine.clock import MAX_INT64, Clock
 from lae_sim.engine.policies import LanePolicy
-from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
+from lae_sim.engine.scheduler import Policy, Schedule, Service, scores_latency, simulate
 from lae_sim.engine.times import Times
 
 _CELLS = 1 << 20  # lanes x frames in memory at once, a few arrays of them
@@ -131,8 +131,9 @@ def _together(
         frames[0], starts[0] = frames[-1], starts[-1]
         k += _STEPS
     lane_by_lane = zip(*done)
+    scored = scores_latency(policy)
     return [
-        None if bad else Schedule(clock, length, frames[:n], starts[:n], ready[:n])
+        None if bad else Schedule(clock, length, frames[:n], starts[:n], ready[:n], scored)
         for (frames, starts, ready), bad, length, n in zip(
             lane_by_lane, faulty.tolist(), lengths.tolist(), calls.tolist()
         )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -128,27 +128,32 @@ def listed(frames: Sequence[int]) -> Policy:
     return next_listed
 
 
+@dataclass(frozen=True)
+class _VotRealtime:
+    grace: int
+    scores_latency: ClassVar[bool] = False
+
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        interval = clock.frame_ticks
+        last, start, ready = calls[-1]
+        overtime = ready - start - interval
+        skipped = 0
+        if overtime > interval and _late_calls(calls, interval, self.grace + 1) > self.grace:
+            skipped = -(-overtime // interval) - 1
+        following = last + 1 + skipped
+        return following, following * interval
+
+
 def vot_realtime(grace: int = 3) -> Policy:
     """The real-time rule of the VOT toolkit, which skips frames but never scores latency.
 
     Every call starts at its frame's arrival, as if the tracker were free. A call that takes longer
     than the frame interval owes its overtime: while more than one interval is owed, a frame is
     skipped and one interval repaid; what is left is forgiven. The first ``grace`` calls over time
-    owe nothing (VOT 2022: 3). The toolkit scores each output at its own frame, so evaluate such a
-    schedule with ``at_arrival=True``.
+    owe nothing (VOT 2022: 3). The toolkit scores each output at its own frame, and so does
+    whatever evaluates such a schedule (see :class:`.scheduler.Schedule`).
     """
-
-    def repay_whole_frames(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
-        interval = clock.frame_ticks
-        last, start, ready = calls[-1]
-        overtime = ready - start - interval
-        skipped = 0
-        if overtime > interval and _late_calls(calls, interval, grace + 1) > grace:
-            skipped = -(-overtime // interval) - 1
-        following = last + 1 + skipped
-        return following, following * interval
-
-    return repay_whole_frames
+    return _VotRealtime(grace)
 
 
 def _late_calls(calls: Sequence[Call], interval: int, most: int) -> int:

@@ -35,6 +35,9 @@ Policy = Callable[[Clock, Sequence[Call]], tuple[int, int]]
 ``calls`` holds the calls so far, the last one being the call that has just become ready. It must
 depend on nothing else, so that a replay repeats a profile. The frame must be newer than
 the last call's; a frame beyond the sequence ends it.
+
+A policy with an attribute ``scores_latency`` that is False never scores latency: its outputs count
+from the arrival of their own frames (see :class:`Schedule`).
 """
 
 
@@ -48,6 +51,8 @@ class Schedule:
         frames: processed frames, int64 [n], increasing, the first is 0.
         start: when each began, int64 [n], ticks.
         ready: when each output became available, int64 [n], ticks.
+        scores_latency: whether an output counts only once it is ready, as the policy has it; False
+            under the VOT toolkit's rule, which lets it count from its own frame's arrival.
     """
 
     clock: Clock
@@ -55,6 +60,7 @@ class Schedule:
     frames: Ints
     start: Ints
     ready: Ints
+    scores_latency: bool = True
 
     @property
     def elapsed_ns(self) -> Ints:
@@ -90,7 +96,13 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
             f"the output of frame {frame} is ready at tick {ready}, beyond 64 bits: "
             f"check the processing times, or write the frame rate {clock.fps} more simply"
         ) from error
-    return Schedule(clock, length, *flat.reshape(-1, 3).T.copy())
+    frames, starts, readies = flat.reshape(-1, 3).T.copy()
+    return Schedule(clock, length, frames, starts, readies, scores_latency(policy))
+
+
+def scores_latency(policy: Policy) -> bool:
+    """Whether a policy's outputs count only once they are ready (see :data:`Policy`)."""
+    return bool(getattr(policy, "scores_latency", True))
 
 
 def _tracker(

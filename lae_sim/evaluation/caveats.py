@@ -46,7 +46,6 @@ def notes_on(
     metadata: Metadata,
     convention: Convention,
     forecasters: Mapping[str, AnyFactory],
-    at_arrival: bool,
 ) -> list[str]:
     """What to say of the scores of a trace, a sentence each."""
     notes = []
@@ -63,7 +62,7 @@ def notes_on(
     if evaluation.missing.any():
         which = "the trace lacks" if evaluation.missing.all() else "some sequences lack"
         notes.append(f"no offline score, nothing recovered: {which} the boxes of skipped frames")
-    if at_arrival:
+    if not evaluation.scores_latency.all():
         notes.append("vot-realtime skips frames but never scores latency")
     parted = np.flatnonzero(evaluation.disagreement > TRUSTED_DISAGREEMENT)
     if len(parted):

@@ -8,7 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from lae_sim._arrays import Floats, Ints
+from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.errors import LaeError, explained
 from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
@@ -31,6 +31,7 @@ class Evaluation:
         truthless: world frames of each that have no ground truth, int64 [S].
         missing: world frames of each without a box in the trace, int64 [S].
         processed: processed frames of each, int64 [S].
+        scores_latency: see :class:`lae_sim.engine.scheduler.Schedule`, bool [S].
         departures: see :class:`lae_sim.replay.run.Run`, int64 [S].
         disagreement: see :class:`lae_sim.replay.run.Run`, float64 [S].
         init_ns: time of the initialisation, int64 [S].
@@ -54,6 +55,7 @@ class Evaluation:
     truthless: Ints
     missing: Ints
     processed: Ints
+    scores_latency: Bools
     departures: Ints
     disagreement: Floats
     init_ns: Ints
@@ -95,7 +97,6 @@ def evaluate(
     forecasters: Mapping[str, AnyFactory],
     sigmas: Sequence[Fraction] = (Fraction(0),),
     convention: Convention = PYSOT,
-    at_arrival: bool = False,
     costs: Mapping[str, int] | None = None,
 ) -> Evaluation:
     """Score the runs of one trace, in groups, so that memory does not grow with the trace.
@@ -106,15 +107,12 @@ def evaluate(
         forecasters: factories by name.
         sigmas: distinct permitted latencies in frames, ascending.
         convention: how frames and thresholds count.
-        at_arrival: score outputs at their own frames, as VOT does (see :func:`pair`).
         costs: what an answer costs, ns, by forecaster; 0 if not named. It delays the answers.
 
     Raises:
         LaeError: if there is no run or no forecaster, or whatever iterating over the runs raises.
     """
-    parts = list(
-        evaluate_groups(runs, metadata, forecasters, sigmas, convention, at_arrival, costs)
-    )
+    parts = list(evaluate_groups(runs, metadata, forecasters, sigmas, convention, costs))
     if not parts:
         raise LaeError("there is nothing to evaluate: no sequences")
     return Evaluation.joined(parts)
@@ -126,7 +124,6 @@ def evaluate_groups(
     forecasters: Mapping[str, AnyFactory],
     sigmas: Sequence[Fraction] = (Fraction(0),),
     convention: Convention = PYSOT,
-    at_arrival: bool = False,
     costs: Mapping[str, int] | None = None,
     frames: int = BATCH_ROWS,
 ) -> Iterator[Evaluation]:
@@ -139,9 +136,7 @@ def evaluate_groups(
     alone: dict[Recording, _Alone] = {}
     for group in batched(runs, frames):
         alone = _alone([run.recording for run in group], convention, alone)
-        yield _evaluate_group(
-            group, metadata, forecasters, sigmas, convention, at_arrival, costs or {}, alone
-        )
+        yield _evaluate_group(group, metadata, forecasters, sigmas, convention, costs or {}, alone)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,14 +173,13 @@ def _evaluate_group(
     forecasters: Mapping[str, AnyFactory],
     sigmas: Sequence[Fraction],
     convention: Convention,
-    at_arrival: bool,
     costs: Mapping[str, int],
     alone: Mapping[Recording, _Alone],
 ) -> Evaluation:
     """Score some runs at once."""
     schedules = [run.schedule for run in runs]
     needed = {0, *(costs.get(name, 0) for name in forecasters)}
-    pairings = {cost: pair(schedules, sigmas, at_arrival, cost) for cost in needed}
+    pairings = {cost: pair(schedules, sigmas, cost) for cost in needed}
     pairing = pairings[0]
     scorer = Scorer([run.recording for run in runs], convention)
     scored = [
@@ -203,6 +197,7 @@ def _evaluate_group(
         truthless=np.array([each.truthless for each in fixed], np.int64),
         missing=np.array([each.missing for each in fixed], np.int64),
         processed=np.diff(pairing.offsets),
+        scores_latency=np.array([schedule.scores_latency for schedule in schedules]),
         departures=np.array([run.departures for run in runs], np.int64),
         disagreement=np.array([run.disagreement for run in runs]),
         init_ns=np.array([each[0] for each in elapsed], np.int64),
@@ -247,11 +242,10 @@ def answers(
     name: str,
     factory: AnyFactory,
     sigma: Fraction = Fraction(0),
-    at_arrival: bool = False,
     cost_ns: int = 0,
 ) -> Answers:
     """What a forecaster answers for every world frame of one run."""
-    pairing = pair([run.schedule], [sigma], at_arrival, cost_ns)
+    pairing = pair([run.schedule], [sigma], cost_ns)
     ((fed, found, boxes),) = _answers([run], metadata, pairing, name, factory)
     return Answers(pairing.frames[fed.output[found.item]], boxes)
 

@@ -36,13 +36,13 @@ class Event(NamedTuple):
     source_frame: int | None = None
 
 
-def event_log(run: Run, sigma: Fraction = Fraction(0), at_arrival: bool = False) -> list[Event]:
+def event_log(run: Run, sigma: Fraction = Fraction(0)) -> list[Event]:
     """All events of a run, for queries at one permitted latency.
 
     Within one tick frames arrive first, then come the tracker's events as it made them, then
     queries. A frame is skipped at the moment when a newer one starts, or at the end of the stream.
     """
-    events = [*_world(run), *_tracker(run), *_queries(run, sigma, at_arrival)]
+    events = [*_world(run), *_tracker(run), *_queries(run, sigma)]
     return sorted(events, key=lambda event: event.tick)  # stable: each stream is in causal order
 
 
@@ -66,8 +66,8 @@ def _tracker(run: Run) -> Iterator[Event]:
         yield Event(schedule.length * schedule.clock.frame_ticks, "frame skipped", skipped)
 
 
-def _queries(run: Run, sigma: Fraction, at_arrival: bool) -> Iterator[Event]:
-    pairing = pair([run.schedule], [sigma], at_arrival)
+def _queries(run: Run, sigma: Fraction) -> Iterator[Event]:
+    pairing = pair([run.schedule], [sigma])
     interval = run.schedule.clock.frame_ticks
     spans = zip(pairing.frames.tolist(), pairing.first[:, 0].tolist(), pairing.end[:, 0].tolist())
     for source, first, end in spans:

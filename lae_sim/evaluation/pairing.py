@@ -98,19 +98,15 @@ class Pairing:
         return map(slice, self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
 
-def pair(
-    schedules: Sequence[Schedule],
-    sigmas: Sequence[Fraction],
-    at_arrival: bool = False,
-    cost_ns: int = 0,
-) -> Pairing:
+def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int = 0) -> Pairing:
     """Pair the outputs of some sequences with their queries.
 
+    Where the schedules' policy never scores latency, each output counts from its own frame's
+    arrival.
+
     Args:
-        schedules: one per sequence, all of one clock.
+        schedules: one per sequence, all of one clock and one way to be scored.
         sigmas: distinct permitted latencies in frames, ascending.
-        at_arrival: let each output count from its own frame's arrival, as the VOT toolkit scores;
-            latency then plays no part.
         cost_ns: what an answer costs to make of an output; it delays all but the initial box.
 
     Raises:
@@ -123,6 +119,9 @@ def pair(
         raise LaeError("permitted latencies must be ascending, each of them once")
     if len({schedule.clock for schedule in schedules}) != 1:
         raise LaeError("sequences of different frame rates cannot be paired together")
+    scored = {schedule.scores_latency for schedule in schedules}
+    if len(scored) != 1:
+        raise LaeError("sequences cannot be paired together if only some of them score latency")
     scale = lcm(*(sigma.denominator for sigma in sigmas))
     numerators = [int(sigma * scale) for sigma in sigmas]
     interval = schedules[0].clock.frame_ticks
@@ -143,12 +142,12 @@ def pair(
     counts = [len(schedule.frames) for schedule in schedules]
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     frames = np.concatenate([schedule.frames for schedule in schedules])
-    if at_arrival:
+    if scored == {False}:
         steps = frames * scale
     elif any((s.start[1:] < s.ready[:-1]).any() for s in schedules):
         raise LaeError(
-            "calls overlap, as under the rule of VOT, which never scores latency: score such a "
-            "schedule with at_arrival=True"
+            "calls overlap, as under the rule of VOT, which never scores latency: such a policy "
+            "says so by an attribute, scores_latency = False"
         )
     else:
         frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]) + cost, interval)

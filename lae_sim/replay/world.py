@@ -47,8 +47,8 @@ class World:
 RECORDED = World({"recorded": by_frame})
 
 
-def parse_policy(text: str) -> tuple[Policy, bool]:
-    """A policy by name, and whether its outputs count from their own frames' arrival.
+def parse_policy(text: str) -> Policy:
+    """A policy by name.
 
     A user's own is named ``package.module:object``: a policy, or a class that makes one.
 
@@ -59,18 +59,18 @@ def parse_policy(text: str) -> tuple[Policy, bool]:
 
     name, colon, value = text.partition(":")
     if text == "latest":
-        return policies.latest, False
+        return policies.latest
     if text == "fifo":
-        return policies.fifo, False
+        return policies.fifo
     if name == "every":
-        return policies.every(_number(text, value, least=1)), False
+        return policies.every(_number(text, value, least=1))
     if name == "shrinking-tail" and value:
-        return policies.shrinking_tail(parse_duration(value)), False
+        return policies.shrinking_tail(parse_duration(value))
     if name == "vot-realtime":
-        return policies.vot_realtime(*([_number(text, value)] if value else [])), True
+        return policies.vot_realtime(*([_number(text, value)] if value else []))
     if colon and name not in ("latest", "fifo", "shrinking-tail"):
         policy: Policy = _own("policy", text)
-        return policy, False
+        return policy
     raise LaeError(
         f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
         "vot-realtime[:GRACE], package.module:object"

@@ -94,13 +94,13 @@ def schedule_file(path: str, clock: Clock) -> Iterator[RunSink]:
 
 
 @contextmanager
-def events_file(path: str, sigma: Fraction, at_arrival: bool) -> Iterator[RunSink]:
+def events_file(path: str, sigma: Fraction) -> Iterator[RunSink]:
     """Write the event log as JSON lines: sequence, tick, ms, event, frame, source_frame."""
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as lines:
 
         def sink(run: Run) -> None:
             ticks_per_ms = run.schedule.clock.ticks_per_ns * 10**6
-            for event in event_log(run, sigma, at_arrival):
+            for event in event_log(run, sigma):
                 record = {
                     "sequence": run.recording.name,
                     "tick": event.tick,

@@ -35,11 +35,10 @@ def curves(
     forecasters: Mapping[str, AnyFactory],
     sigma: Fraction = Fraction(0),
     convention: Convention = PYSOT,
-    at_arrival: bool = False,
     costs: Mapping[str, int] | None = None,
 ) -> Curves:
     """Curves of the offline boxes, where the trace holds every frame, and of each forecaster."""
-    found = evaluate(runs, metadata, forecasters, [sigma], convention, at_arrival, costs)
+    found = evaluate(runs, metadata, forecasters, [sigma], convention, costs)
     named = dict(zip(forecasters, zip(found.success, found.precision)))
     if not found.missing.any():
         named = {"offline": (found.offline_success, found.offline_precision), **named}

@@ -147,7 +147,6 @@ class Scene:
         images: ImageSequence,
         metadata: Metadata,
         forecasters: Mapping[str, AnyFactory],
-        at_arrival: bool = False,
     ) -> Scene:
         """The scene of a run and what forecasters make of it (see :func:`.evaluate.answers`).
 
@@ -162,8 +161,7 @@ class Scene:
                 f"{len(images)} images: is this the dataset that it was recorded on?"
             )
         found = {
-            name: answers(run, metadata, name, factory, at_arrival=at_arrival)
-            for name, factory in forecasters.items()
+            name: answers(run, metadata, name, factory) for name, factory in forecasters.items()
         }
         return cls(run, images, found)
 

@@ -248,7 +248,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
             "approximate_outputs": departures,
             "calls": calls,
             "notes": [
-                *notes_on(about, trace.metadata, convention, only, at_arrival=False),
+                *notes_on(about, trace.metadata, convention, only),
                 *cost_notes({cell.forecaster: cell.cost_ns} if cell.cost_ns else {}),
             ],
         }
@@ -328,7 +328,7 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
         trace: the setting's, as it was read.
     """
     timing = None if setting.timing is None else read_trace(setting.timing.path)
-    policy, _ = parse_policy(setting.policy)
+    policy = parse_policy(setting.policy)
     source = scaled(_source(setting), setting.scale)
     times = source(next(iter(timing or trace)))
     engine = "batch" if batchable([times], policy) else "simpy"

@@ -81,7 +81,7 @@ class Plan:
             {name: parse_latency(name) for name in fixed},
             study.scales,
             study.fps[0],
-            parse_policy(study.policies[0])[0],
+            parse_policy(study.policies[0]),
         )
         return fitted(read, self.forecasters, world, study.folds, study.seed, progress)
 

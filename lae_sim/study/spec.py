@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lae_sim.engine.clock import parse_fps, parse_rational
+from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.evaluation.pairing import SIGMA_GRID
@@ -74,7 +75,7 @@ class Study:
         for latency in self.latencies:
             _check_latency(latency)
         for policy in self.policies:
-            if parse_policy(policy)[1]:
+            if not scores_latency(parse_policy(policy)):
                 raise LaeError(f"policies: {policy} never scores latency: it goes with replay")
         for cost in self.costs:
             if cost.rpartition("=")[2] == "measured":

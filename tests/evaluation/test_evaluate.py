@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 
@@ -167,15 +168,18 @@ def test_evaluation_agrees_with_the_event_driven_world(
 @given(groups(), st.booleans())
 @settings(max_examples=25)
 def test_the_grid_is_its_sigmas_one_by_one_and_groups_are_their_sequences(
-    group: tuple[Fraction, list[Recording]], at_arrival: bool
+    group: tuple[Fraction, list[Recording]], scores_latency: bool
 ) -> None:
     fps, recordings = group
     runs = [replay_sequence(recording, Clock.at(fps)) for recording in recordings]
+    runs = [
+        replace(run, schedule=replace(run.schedule, scores_latency=scores_latency)) for run in runs
+    ]
     sigmas = [Fraction(-1, 2), *SIGMA_GRID[::5], Fraction(4, 3)]
-    together = evaluate(runs, EVERY, FORECASTERS, sigmas, at_arrival=at_arrival)
+    together = evaluate(runs, EVERY, FORECASTERS, sigmas)
     for s, run in enumerate(runs):
         for m, sigma in enumerate(sigmas):
-            alone = evaluate([run], EVERY, FORECASTERS, [sigma], at_arrival=at_arrival)
+            alone = evaluate([run], EVERY, FORECASTERS, [sigma])
             for metric in METRICS:
                 np.testing.assert_array_equal(
                     together.scores[metric][:, s, m], alone.scores[metric][:, 0, 0]
@@ -282,7 +286,7 @@ def test_joined_is_the_evaluation_of_all() -> None:
 def test_vot_scores_each_output_at_its_own_frame() -> None:
     recording = moving(50, elapsed=10_000_000)
     run = replay_sequence(recording, CLOCK, policy=vot_realtime())
-    found = evaluate([run], EVERY, {"hold": Hold}, at_arrival=True)
+    found = evaluate([run], EVERY, {"hold": Hold})
     for metric in METRICS:
         assert found.scores[metric].item() == found.offline[metric].item()
     assert found.mismatch_sum.item() == 0

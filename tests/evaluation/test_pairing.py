@@ -102,7 +102,7 @@ def test_histories_and_pairs_list_each_fed_output_and_each_pair(
 @settings(max_examples=30)
 def test_at_arrival_latency_plays_no_part(world: World, sigmas: list[Fraction]) -> None:
     schedule = schedule_of(world)
-    pairing = pair([schedule], sigmas, at_arrival=True)
+    pairing = pair([replace(schedule, scores_latency=False)], sigmas)
     for m, sigma in enumerate(sigmas):
         expected = [
             max([0, *(int(f) for f in schedule.frames if f <= i + sigma)])
@@ -145,7 +145,8 @@ def test_a_cost_beyond_the_clock_is_refused() -> None:
 
 def test_where_latency_is_not_scored_a_cost_is_not_either() -> None:
     schedule = simulate(9, CLOCK, lambda frame: 47_000_000, latest)
-    free, dear = (pair([schedule], ZERO, True, cost) for cost in (0, 10**9))
+    schedule = replace(schedule, scores_latency=False)
+    free, dear = (pair([schedule], ZERO, cost) for cost in (0, 10**9))
     np.testing.assert_array_equal(free.first, dear.first)
 
 
@@ -239,13 +240,14 @@ def test_the_finest_sigma_that_fits_is_exact() -> None:
 def test_a_vot_schedule_is_scored_at_arrival() -> None:
     schedule = simulate(6, CLOCK, lambda frame: 100_000_000, vot_realtime(0))
     assert schedule.frames.tolist() == [0, 2, 4]
-    assert psis(pair([schedule], ZERO, at_arrival=True), 0, 0) == [0, 0, 2, 2, 4, 4]
+    assert psis(pair([schedule], ZERO), 0, 0) == [0, 0, 2, 2, 4, 4]
 
 
 def test_overlapping_calls_are_scored_by_the_newest_frame_that_is_ready_or_refused() -> None:
     # Frame 1 is ready at 540 ms, long after frame 2 at 90 ms: vot_realtime lets calls overlap.
     stall = [0, 500_000_000, 10_000_000, 10_000_000, 10_000_000, 10_000_000]
     schedule = simulate(6, CLOCK, stall.__getitem__, vot_realtime(3))
+    schedule = replace(schedule, scores_latency=True)
     assert schedule.frames.tolist() == [0, 1, 2, 3, 4, 5]
     try:
         pairing = pair([schedule], ZERO)
