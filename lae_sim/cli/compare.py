@@ -115,7 +115,7 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.out and Path(arguments.out).suffix not in (".csv", ".parquet"):
         raise LaeError(f"--out {arguments.out}: name a .csv or .parquet file")
     if arguments.plot:
-        from lae_sim.report.figures import check_format
+        from lae_sim.report.style import check_format
 
         check_format(arguments.plot)
     from lae_sim.engine.scheduler import scores_latency
@@ -205,8 +205,8 @@ def _tell(
     summary = summarise(table, **settings)
     divided = None if attributes is None else by_attribute(table, attributes, **settings)
     if arguments.plot:
-        from lae_sim.report.figures import save
         from lae_sim.report.forecaster_figures import overview
+        from lae_sim.report.style import save
 
         save(overview(summary, metrics[0]), arguments.plot)
     if arguments.sigma_grid:

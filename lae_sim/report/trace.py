@@ -12,6 +12,7 @@ from itertools import pairwise
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
+from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
 from lae_sim.report.table import COUNT, Column, Number, Table, text_of
 from lae_sim.trace.describe import Report, gathered
 
@@ -202,18 +203,15 @@ def profile_table(reports: Sequence[Mapping[str, Any]]) -> str:
     return text_of(Table.of(columns, reports))
 
 
+@styled
 def plot_times(found: Sequence[tuple[Report, Sequence[SequenceTimes]]], path: str) -> None:
     """Draw, for each trace, a histogram of its times, and the times over the run."""
-    from matplotlib.figure import Figure
-
-    from lae_sim.report import figures as plots
-
-    figure = Figure(figsize=(11, 3.6 * len(found)), layout="constrained")
+    figure = new_figure(11, 3.6 * len(found))
     rows = figure.subplots(len(found), 2, squeeze=False, width_ratios=(1, 2))
     for (left, right), (report, sequences) in zip(rows, found):
         times = report["times"]
         if histogram := times["histogram"]:
-            left.stairs(histogram["counts"], histogram["edges_ms"], fill=True)
+            left.stairs(histogram["counts"], histogram["edges_ms"], fill=True, color=BLUE)
             outside = histogram["below"] + histogram["above"]
             left.set_title(f"{outside:,} of {times['calls']['n']:,} calls are outside", fontsize=9)
             calls = times["calls"]
@@ -222,10 +220,10 @@ def plot_times(found: Sequence[tuple[Report, Sequence[SequenceTimes]]], path: st
         start = 0
         for number, sequence in enumerate(sequences):
             places = range(start, start := start + len(sequence.elapsed_ns))
-            ms, colour = sequence.elapsed_ns / 1e6, f"C{number % 2 * 9}"
+            ms, colour = sequence.elapsed_ns / 1e6, (BLUE, SKY_BLUE)[number % 2]
             right.plot(places, ms, ".", ms=1.5, color=colour, rasterized=True)
         order = "as they were run" if times["order_known"] else "in order of their names"
         right.set(xlabel=f"calls, sequences {order}", ylabel="time (ms)")
-        right.axhline(times["frame_interval_ms"], color="tab:red", ls="--", lw=1)
+        right.axhline(times["frame_interval_ms"], color=VERMILION, ls="--", lw=1)
         right.set_title(f"{report['trace']} (dashed: the interval between frames)", fontsize=9)
-    plots.save(figure, path)
+    save(figure, path)
