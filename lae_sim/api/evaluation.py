@@ -420,7 +420,7 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
     curves = {}
     for part in parts:
         prefix = f"{part.scenario.label}: " if len(traces) > 1 else ""
-        found = figures.curves_of(part.evaluation, list(part.scenario.forecasters))
+        found = figures.mean_curves(part.evaluation, part.scenario.forecasters)
         curves.update({prefix + name: curve for name, curve in found.items()})
     return figures.success_and_precision(curves, title)
 

@@ -66,9 +66,9 @@ def forecaster_names(forecasters: Forecasters) -> tuple[tuple[str, ...], dict[st
     """
     if isinstance(forecasters, Mapping):
         return tuple(forecasters), dict(forecasters)
-    names, objects = [], {}
-    given = [forecasters] if isinstance(forecasters, Trainer) else several(forecasters)
-    for each in given:
+    names: list[str] = []
+    objects: dict[str, Any] = {}
+    for each in several(forecasters):
         if isinstance(each, str):
             names.append(each)
         elif callable(each) or isinstance(each, Trainer):

@@ -135,7 +135,7 @@ def row_of(scores: Scores) -> dict[str, Any]:
     }
 
 
-def told_setting(rows: Sequence[Row], but: str = "") -> str:
+def shared_setting(rows: Sequence[Mapping[str, Any]], but: str = "") -> str:
     """What some rows have in common, in words; one key may be left out."""
     parts = []
     labels = ("policy", "world", "latency", "times x", "convention")

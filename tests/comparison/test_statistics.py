@@ -22,7 +22,7 @@ from lae_sim.comparison.statistics import (
     summarise,
 )
 from lae_sim.errors import LaeError
-from lae_sim.report.forecasters import comparison_table
+from lae_sim.report.comparison import comparison_table
 from lae_sim.report.table import p_label, setting_label
 
 KEYS = ["trace", "latency", "scale", "sigma", "forecaster", "metric"]
