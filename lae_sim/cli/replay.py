@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import product
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import (
@@ -23,6 +25,8 @@ from lae_sim.files import check_distinct, labels
 from lae_sim.learning.registry import FORECASTERS, find_camera, load_forecaster
 
 if TYPE_CHECKING:
+    from lae_sim.evaluation.evaluate import Observer
+    from lae_sim.evaluation.totals import CurveTotals
     from lae_sim.forecast.base import AnyFactory
     from lae_sim.replay.run import Run, Runs
     from lae_sim.replay.world import World
@@ -149,12 +153,16 @@ def _replay(arguments: argparse.Namespace) -> None:
 
         check_format(arguments.plot)
     with ExitStack() as files:  # whatever fails, no file is left behind
-        reports = [report(job, _sinks(job, arguments, files), arguments) for job in jobs]
-        if arguments.plot:
-            _plot(jobs, reports, swept, arguments)
+        scored = [_scored(job, _observers(job, arguments, files), arguments) for job in jobs]
+        reports = [report for report, _ in scored]
+        if arguments.plot and swept:
+            _plot_sweep(jobs, reports, swept, arguments)
+        elif arguments.plot:
+            _plot_curves(jobs, [curves for _, curves in scored], arguments)
     if arguments.json:
         document = {"format": "lae-replay", "version": "1.0", "lae_sim": __version__}
-        print(json.dumps({**document, "traces": reports}, indent=2, allow_nan=False))
+        json.dump({**document, "traces": reports}, sys.stdout, indent=2, allow_nan=False)
+        print()
     else:
         _print_tables(jobs, reports, shown, swept, arguments)
 
@@ -175,82 +183,79 @@ def _check_files(arguments: argparse.Namespace, swept: Sequence[str]) -> None:
     check_distinct([path for path in outputs if path], inputs)
 
 
-def _sinks(
-    job: Job, arguments: argparse.Namespace, files: ExitStack
-) -> list[Callable[[Run], None]]:
+def _observers(job: Job, arguments: argparse.Namespace, files: ExitStack) -> list[Observer]:
     """Open the files that were asked for; what each does with a run."""
     from pathlib import Path
 
-    from lae_sim.evaluation.evaluate import answers
     from lae_sim.report import export
     from lae_sim.report.timeline import timeline_file
 
-    sinks: list[Callable[[Run], None]] = []
-    answer_sinks: list[export.AnswerSink] = []
+    observers: list[Observer] = []
     if arguments.schedule:
-        sinks.append(files.enter_context(export.schedule_file(arguments.schedule, job.runs.clock)))
+        schedule = export.schedule_file(arguments.schedule, job.runs.clock)
+        observers.append(files.enter_context(schedule))
     if arguments.events:
         events = export.events_file(arguments.events, arguments.sigma[0])
-        sinks.append(files.enter_context(events))
+        observers.append(files.enter_context(events))
     if arguments.timeline:
         costs = {name: job.costs.get(name, 0) for name in arguments.forecaster}
-        drawn = timeline_file(arguments.timeline, arguments.sigma[0], costs)
-        sinks.append(files.enter_context(drawn))
+        timeline = timeline_file(arguments.timeline, arguments.sigma[0], costs)
+        observers.append(files.enter_context(timeline))
     if arguments.outputs:
-        answer_sinks.append(files.enter_context(export.outputs_file(arguments.outputs)))
+        outputs = export.outputs_file(arguments.outputs, _observed(arguments))
+        observers.append(files.enter_context(outputs))
     if arguments.export_txt:
         stem = Path(job.label).with_suffix("").as_posix().strip("/.").replace("/", "-")
         names = export.result_names(stem, arguments.forecaster, arguments.sigma)
         folders = export.result_folders(arguments.export_txt, names)
-        answer_sinks.append(files.enter_context(folders))
-
-    def answer(run: Run) -> None:
-        for name in arguments.forecaster:
-            factory = job.forecasters[name]
-            for sigma in arguments.sigma:
-                cost_ns = job.costs.get(name, 0)
-                found = answers(run, job.trace.metadata, name, factory, sigma, cost_ns)
-                for sink in answer_sinks:
-                    sink(run, name, sigma, found)
-
-    return [*sinks, answer] if answer_sinks else sinks
+        observers.append(files.enter_context(folders))
+    return observers
 
 
-def _plot(
+def _observed(arguments: argparse.Namespace) -> list[tuple[str, Fraction]]:
+    """The answers that files are to hold, by forecaster and permitted latency."""
+    if not (arguments.outputs or arguments.export_txt):
+        return []
+    return list(product(arguments.forecaster, arguments.sigma))
+
+
+def _plot_sweep(
     jobs: Sequence[Job],
     reports: Sequence[Report],
     swept: Sequence[str],
     arguments: argparse.Namespace,
 ) -> None:
-    """Draw success and precision of all traces, or how AUC and DP change over a sweep."""
+    """Draw how AUC and DP change over a sweep."""
+    from lae_sim.report import figures
+
+    names, sigma = [job.label for job in jobs], float(arguments.sigma[0])
+    title = _title(jobs, arguments)
+    figures.save(figures.sweep_figure(reports, names, sigma, swept, title), arguments.plot)
+
+
+def _plot_curves(
+    jobs: Sequence[Job], curves: Sequence[CurveTotals], arguments: argparse.Namespace
+) -> None:
+    """Draw success and precision of all traces."""
     from pathlib import Path
 
-    from lae_sim.evaluation.metrics import find_convention
-    from lae_sim.report import figures as plots
+    from lae_sim.report import figures
+
+    named: figures.Curves = {}
+    for job, totals in zip(jobs, curves):
+        prefix = f"{Path(job.label).with_suffix('')}: " if len(arguments.traces) > 1 else ""
+        means = figures.named_curves(totals, list(job.forecasters))
+        named.update({prefix + name: curve for name, curve in means.items()})
+    figure = figures.success_and_precision(named, _title(jobs, arguments))
+    figures.save(figure, arguments.plot)
+
+
+def _title(jobs: Sequence[Job], arguments: argparse.Namespace) -> str:
     from lae_sim.report.export import sigma_text
 
-    sigma, several = arguments.sigma[0], len(arguments.traces) > 1
-    title = "" if several else f"{jobs[0].label}: "
-    title += f"sigma {sigma_text(sigma)}, convention {jobs[0].world.convention}"
-    if swept:
-        from lae_sim.report.figures import sweep_figure
-
-        names = [job.label for job in jobs]
-        plots.save(sweep_figure(reports, names, float(sigma), swept, title), arguments.plot)
-        return
-    named: plots.Curves = {}
-    for job in jobs:
-        found = plots.curves(
-            job.runs,
-            job.trace.metadata,
-            job.forecasters,
-            sigma,
-            find_convention(job.world.convention),
-            job.costs,
-        )
-        prefix = f"{Path(job.label).with_suffix('')}: " if several else ""
-        named.update({prefix + name: curve for name, curve in found.items()})
-    plots.save(plots.success_and_precision(named, title), arguments.plot)
+    title = "" if len(arguments.traces) > 1 else f"{jobs[0].label}: "
+    sigma = sigma_text(arguments.sigma[0])
+    return title + f"sigma {sigma}, convention {jobs[0].world.convention}"
 
 
 def _print_tables(
@@ -328,35 +333,49 @@ def jobs_of(
         yield Job(path, label, trace, world, runs, forecasters, costs)
 
 
-def report(
-    job: Job, sinks: Sequence[Callable[[Run], None]], arguments: argparse.Namespace
-) -> Report:
-    """Replay and score one trace, giving each run to the sinks."""
+def _scored(
+    job: Job, observers: Sequence[Observer], arguments: argparse.Namespace
+) -> tuple[Report, CurveTotals]:
+    """Replay and score one trace, each run seen by the observers."""
     from lae_sim.evaluation.caveats import SkippedStalls, notes_on
-    from lae_sim.evaluation.evaluate import evaluate
+    from lae_sim.evaluation.evaluate import evaluate_groups
     from lae_sim.evaluation.metrics import find_convention
+    from lae_sim.evaluation.totals import Totals
     from lae_sim.forecast.costs import cost_notes
-    from lae_sim.report.replay import attribute_members, trace_report
+    from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
 
-    metadata = job.trace.metadata
+    metadata, forecasters = job.trace.metadata, list(job.forecasters)
     stalls = SkippedStalls()
     if job.world.latency == "recorded" and job.world.timing is None:
-        sinks = [*sinks, stalls]
-    runs = _written(_progress(job.runs, job.path, job.trace.frames), sinks)
+        observers = [*observers, stalls]
     convention = find_convention(job.world.convention)
-    evaluation = evaluate(runs, metadata, job.forecasters, job.world.sigmas, convention, job.costs)
-    members = attribute_members(metadata, evaluation.sequences)
-    notes = notes_on(evaluation, metadata, convention, job.forecasters)
+    totals = Totals(forecasters.index("hold"))
+    per_sequence = SequenceRows(forecasters) if arguments.per_sequence else None
+    for part in evaluate_groups(
+        _progress(job.runs, job.path, job.trace.frames),
+        metadata,
+        job.forecasters,
+        job.world.sigmas,
+        convention,
+        job.costs,
+        curves_at=arguments.sigma[0],
+        observers=observers,
+        observed=_observed(arguments),
+    ):
+        sequences = part.replay.sequences if arguments.attributes else ()
+        totals.add(part, attribute_members(metadata, sequences))
+        if per_sequence is not None:
+            per_sequence.add(part)
+    notes = notes_on(totals.replay, metadata, convention, job.forecasters)
     figures = trace_report(
-        evaluation,
+        totals,
         job.runs.clock,
-        list(job.forecasters),
+        forecasters,
         job.world.sigmas,
         job.world.convention,
-        members if arguments.attributes else None,
-        arguments.per_sequence,
+        per_sequence,
     )
-    return {
+    report = {
         "trace": job.path,
         "tracker": metadata.tracker,
         "dataset": metadata.dataset,
@@ -373,14 +392,7 @@ def report(
         "notes": [*notes, *stalls.notes(), *cost_notes(job.costs)],
         **figures,
     }
-
-
-def _written(runs: Iterable[Run], sinks: Sequence[Callable[[Run], None]]) -> Iterator[Run]:
-    """The runs, each given to every sink as it passes."""
-    for run in runs:
-        for sink in sinks:
-            sink(run)
-        yield run
+    return report, totals.curves
 
 
 def _progress(runs: Iterable[Run], path: str, frames: int | None) -> Iterator[Run]:

@@ -11,9 +11,10 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.evaluate import evaluate_groups
 from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS, PYSOT, Convention
-from lae_sim.evaluation.pairing import pair
+from lae_sim.evaluation.pairing import Pairing, pair
+from lae_sim.evaluation.totals import CurveTotals
 from lae_sim.files import written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.replay.run import Run
@@ -38,20 +39,18 @@ def curves(
     costs: Mapping[str, int] | None = None,
 ) -> Curves:
     """Curves of the offline boxes, where the trace holds every frame, and of each forecaster."""
-    found = evaluate(runs, metadata, forecasters, [sigma], convention, costs)
-    named = dict(zip(forecasters, zip(found.success, found.precision)))
-    if not found.missing.any():
-        named = {"offline": (found.offline_success, found.offline_precision), **named}
-    return {
-        name: (_mean(success), _mean(precision)) for name, (success, precision) in named.items()
-    }
+    totals = CurveTotals()
+    for part in evaluate_groups(runs, metadata, forecasters, [sigma], convention, costs):
+        totals.add(part)
+    return named_curves(totals, list(forecasters))
 
 
-def _mean(curves: Floats) -> Floats:
-    """Mean of the sequences that the convention counts; NaN if there is none."""
-    kept = curves[~np.isnan(curves).any(axis=1)]
-    mean: Floats = kept.mean(axis=0) if len(kept) else np.full(curves.shape[1], np.nan)
-    return mean
+def named_curves(totals: CurveTotals, forecasters: Sequence[str]) -> Curves:
+    """Mean curves by name, of sequences that have been scored; offline too where it is known."""
+    means = {name: totals.curves(f) for f, name in enumerate(forecasters)}
+    if totals.complete:
+        means = {"offline": totals.offline, **means}
+    return {name: (mean.success, mean.precision) for name, mean in means.items()}
 
 
 def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Figure:
@@ -95,7 +94,13 @@ def _style(kinds: list[str], kind: int, traces: int) -> str:
     return ("-", ":", "-.")[others.index(kinds[kind]) % 3] if traces > 1 else "-"
 
 
-def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int = 20) -> Figure:
+def timeline(
+    run: Run,
+    sigma: Fraction = Fraction(0),
+    first: int = 0,
+    count: int = 20,
+    pairing: Pairing | None = None,
+) -> Figure:
     """When frames arrived and were processed or skipped, and which output answered each query.
 
     Args:
@@ -103,6 +108,7 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
         sigma: permitted latency of the queries, frames.
         first: first world frame shown.
         count: number of world frames shown.
+        pairing: of the run at that sigma, where it is known already.
     """
     schedule = run.schedule
     clock = schedule.clock
@@ -123,7 +129,8 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
             axes.barh(1, length, left=begin, height=0.42, color="tab:blue", edgecolor="white")
             if begin + length / 2 < (end + 0.5) * frame_ms:
                 axes.text(begin + length / 2, 1, str(frame), ha="center", va="center", color="w")
-    _draw_queries(axes, run, sigma, first, end)
+    known = pairing or pair([schedule], [sigma])
+    _draw_queries(axes, run, sigma, known, first, end)
     axes.set_yticks(
         [2, 1, 0], ["world frame\n(hollow: skipped)", "tracker busy", "query and source"]
     )
@@ -132,11 +139,12 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
     return figure
 
 
-def _draw_queries(axes: Axes, run: Run, sigma: Fraction, first: int, end: int) -> None:
+def _draw_queries(
+    axes: Axes, run: Run, sigma: Fraction, pairing: Pairing, first: int, end: int
+) -> None:
     """A mark for each query, joined to the moment when the output that answers it was ready."""
     schedule = run.schedule
     clock = schedule.clock
-    pairing = pair([schedule], [sigma])
     spans = zip(schedule.frames, schedule.ready, pairing.first[:, 0], pairing.end[:, 0])
     for source, ready, begin, stop in spans:
         for frame in range(max(begin, first), min(stop, end)):
