@@ -149,7 +149,7 @@ def _replay(arguments: argparse.Namespace) -> None:
     named = zip(arguments.traces, labels(arguments.traces))
     jobs = [job for path, label in named for job in jobs_of(path, label, worlds, arguments)]
     if arguments.plot:
-        from lae_sim.report.figures import check_format
+        from lae_sim.report.style import check_format
 
         check_format(arguments.plot)
     with ExitStack() as files:  # whatever fails, no file is left behind
@@ -226,11 +226,12 @@ def _plot_sweep(
     arguments: argparse.Namespace,
 ) -> None:
     """Draw how AUC and DP change over a sweep."""
-    from lae_sim.report import figures
+    from lae_sim.report.figures import sweep_figure
+    from lae_sim.report.style import save
 
     names, sigma = [job.label for job in jobs], float(arguments.sigma[0])
     title = _title(jobs, arguments)
-    figures.save(figures.sweep_figure(reports, names, sigma, swept, title), arguments.plot)
+    save(sweep_figure(reports, names, sigma, swept, title), arguments.plot)
 
 
 def _plot_curves(
@@ -240,14 +241,14 @@ def _plot_curves(
     from pathlib import Path
 
     from lae_sim.report import figures
+    from lae_sim.report.style import save
 
     named: figures.Curves = {}
     for job, totals in zip(jobs, curves):
         prefix = f"{Path(job.label).with_suffix('')}: " if len(arguments.traces) > 1 else ""
         means = figures.named_curves(totals, list(job.forecasters))
         named.update({prefix + name: curve for name, curve in means.items()})
-    figure = figures.success_and_precision(named, _title(jobs, arguments))
-    figures.save(figure, arguments.plot)
+    save(figures.success_and_precision(named, _title(jobs, arguments)), arguments.plot)
 
 
 def _title(jobs: Sequence[Job], arguments: argparse.Namespace) -> str:
@@ -342,7 +343,7 @@ def _scored(
     from lae_sim.evaluation.metrics import find_convention
     from lae_sim.evaluation.totals import Totals
     from lae_sim.forecast.costs import cost_notes
-    from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
+    from lae_sim.report.replay import attribute_members, trace_report
 
     metadata, forecasters = job.trace.metadata, list(job.forecasters)
     stalls = SkippedStalls()
@@ -350,7 +351,7 @@ def _scored(
         observers = [*observers, stalls]
     convention = find_convention(job.world.convention)
     totals = Totals(forecasters.index("hold"))
-    per_sequence = SequenceRows(forecasters) if arguments.per_sequence else None
+    per_sequence = []
     for part in evaluate_groups(
         _progress(job.runs, job.path, job.trace.frames),
         metadata,
@@ -364,8 +365,8 @@ def _scored(
     ):
         sequences = part.replay.sequences if arguments.attributes else ()
         totals.add(part, attribute_members(metadata, sequences))
-        if per_sequence is not None:
-            per_sequence.add(part)
+        if arguments.per_sequence:
+            per_sequence.append(part.without_curves())
     notes = notes_on(totals.replay, metadata, convention, job.forecasters)
     figures = trace_report(
         totals,
@@ -373,6 +374,7 @@ def _scored(
         forecasters,
         job.world.sigmas,
         job.world.convention,
+        arguments.attributes,
         per_sequence,
     )
     report = {

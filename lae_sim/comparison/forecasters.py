@@ -101,9 +101,7 @@ def fitted(
     trainers = {name: each for name, each in forecasters.items() if isinstance(each, Trainer)}
     if not trainers:
         return ready, []
-    examples = Examples.joined(
-        [Examples.of(list(world.replay(trace))) for trace in traces.values() for world in worlds]
-    )
+    examples = Examples.of_traces(traces.values(), worlds)
     dealt = assign_folds(examples.sequences, folds, seed)
     for name, trainer in trainers.items():
         ready[name] = cross_fitted(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import TypeAlias, TypeVar
 
@@ -14,7 +14,7 @@ from lae_sim.errors import LaeError, explained
 from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scorer
-from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, forecast, own
+from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
@@ -129,6 +129,12 @@ class Evaluation:
     offline: Mapping[str, Floats]
     offline_curves: Curves
 
+    def without_curves(self) -> Evaluation:
+        """The same with no thresholds in its curves."""
+        return replace(
+            self, curves=_no_curves(self.curves), offline_curves=_no_curves(self.offline_curves)
+        )
+
     @classmethod
     def joined(cls, parts: Sequence[Evaluation]) -> Evaluation:
         """The evaluations of some groups of sequences as one."""
@@ -141,6 +147,10 @@ class Evaluation:
             offline={m: np.concatenate([p.offline[m] for p in parts]) for m in METRICS},
             offline_curves=_joined([part.offline_curves for part in parts]),
         )
+
+
+def _no_curves(curves: Curves) -> Curves:
+    return Curves(curves.success[..., :0].copy(), curves.precision[..., :0].copy())
 
 
 def _joined(records: Sequence[Record], axis: int = 0) -> Record:
@@ -452,7 +462,7 @@ def _answers(
             if isinstance(factory, SequenceFactory)
             else [factory] * len(runs)
         )
-    for fed in histories(pairing, memoryless=own(factory, "memoryless")).parts(_PART):
+    for fed in histories(pairing, memoryless=defines(factory, "memoryless")).parts(_PART):
         found = pairs(pairing, fed)
         lanes = lanes_of(runs, pairing, fed, image_sizes)
         shared = {id(its): its for its in factories}.values()

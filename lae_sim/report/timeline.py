@@ -60,16 +60,17 @@ def timeline_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Itera
         )
     if any(costs.values()):
         raise LaeError(f"the picture {path} cannot show what forecasters cost: name a .json file")
-    from lae_sim.report import figures as plots
+    from lae_sim.report.figures import timeline
+    from lae_sim.report.style import save
 
     pictures: list[Figure] = []
 
     def draw_first(scored: ScoredRun) -> None:
         if not pictures:
-            pictures.append(plots.timeline(scored.run, sigma, pairing=scored.pairing(sigma)))
+            pictures.append(timeline(scored.run, sigma, pairing=scored.pairing(sigma)))
 
     yield draw_first
-    plots.save(pictures[0], path)
+    save(pictures[0], path)
 
 
 @contextmanager
