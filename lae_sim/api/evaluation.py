@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lae_sim.api.inputs import Forecasters, Progress, forecaster_names, labelled_traces
+from lae_sim.api.inputs import Forecasters, forecaster_names, labelled_traces
 from lae_sim.boxes import iou
 from lae_sim.engine.clock import Number, exact
 from lae_sim.engine.scheduler import Policy
@@ -24,6 +24,7 @@ from lae_sim.evaluation.totals import Totals
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.learning.registry import find_camera, load_forecaster
+from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import TraceLike, World, label_of
@@ -59,7 +60,7 @@ class Scenario:
     def evaluate(
         self,
         observers: Sequence[Observer] = (),
-        advance: Callable[[int, str], None] = lambda frames, what: None,
+        progress: Callable[[int], object] = lambda frames: None,
         observed: Collection[tuple[str, Fraction]] = (),
         curves_at: Fraction | None = None,
         attributes: bool = True,
@@ -69,7 +70,7 @@ class Scenario:
 
         Args:
             observers: take each run once it is scored.
-            advance: told of the world frames of each run.
+            progress: called with the world frames of each run.
             observed: the answers that observers look at, by forecaster and permitted latency.
             curves_at: the permitted latency of the curves; the first by default.
             attributes: whether to add up the scores by the dataset's attributes too.
@@ -84,7 +85,7 @@ class Scenario:
         def advanced() -> Iterator[Run]:
             for run in self.runs:
                 yield run
-                advance(len(run), "")
+                progress(len(run))
 
         totals, kept = Totals(list(self.forecasters).index("hold")), []
         for part in evaluate_groups(
@@ -528,7 +529,31 @@ def evaluate(
         dataset=dataset,
         camera_lag=camera_lag,
     )
-    frames = [trace.frames for trace in opened.values()]
-    total = None if None in frames or wanted else sum(map(int, frames)) * len(worlds)  # type: ignore[arg-type]
-    with Progress(progress, total, "replay", "frames") as advance:
-        return EvaluationResult(tuple(each.evaluate(advance=advance) for each in asked))
+    return EvaluationResult(tuple(evaluated(asked, progress)))
+
+
+def evaluated(
+    asked: Sequence[Scenario],
+    show: bool | None = None,
+    observers: Sequence[Observer] = (),
+) -> list[Evaluated]:
+    """Replay and score scenarios one after another, with a progress bar.
+
+    Args:
+        asked: what to replay and score.
+        show: whether to show the bar; by default on a terminal and in a notebook.
+        observers: take each run once it is scored.
+    """
+    known = [scenario.trace.frames for scenario in asked]
+    total = None if None in known else sum(map(int, known))  # type: ignore[arg-type]
+    done, found = 0, []
+    with ProgressBar("replay", "frames", show) as bar:
+
+        def advance(frames: int) -> None:
+            nonlocal done
+            done += frames
+            bar(done, total, scenario.label)
+
+        for scenario in asked:
+            found.append(scenario.evaluate(observers, advance))
+    return found
