@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from fractions import Fraction
 from typing import TypeAlias, TypeVar
 
@@ -129,12 +129,6 @@ class Evaluation:
     offline: Mapping[str, Floats]
     offline_curves: Curves
 
-    def without_curves(self) -> Evaluation:
-        """The same with no thresholds in its curves."""
-        return replace(
-            self, curves=_no_curves(self.curves), offline_curves=_no_curves(self.offline_curves)
-        )
-
     @classmethod
     def joined(cls, parts: Sequence[Evaluation]) -> Evaluation:
         """The evaluations of some groups of sequences as one."""
@@ -147,10 +141,6 @@ class Evaluation:
             offline={m: np.concatenate([p.offline[m] for p in parts]) for m in METRICS},
             offline_curves=_joined([part.offline_curves for part in parts]),
         )
-
-
-def _no_curves(curves: Curves) -> Curves:
-    return Curves(curves.success[..., :0].copy(), curves.precision[..., :0].copy())
 
 
 def _joined(records: Sequence[Record], axis: int = 0) -> Record:

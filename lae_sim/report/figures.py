@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Floats
-from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS
 from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.evaluation.totals import CurveTotals
@@ -39,20 +38,8 @@ Curves = dict[str, tuple[Floats, Floats]]
 """By name: success over IoU thresholds, and precision over 0..50 px, mean over sequences."""
 
 
-def mean_curves(evaluation: Evaluation, forecasters: Iterable[str]) -> Curves:
-    """Curves of the offline boxes, where the trace holds every frame, and of each forecaster.
-
-    Args:
-        evaluation: whose curves are those of its first permitted latency.
-        forecasters: names of its forecasters.
-    """
-    totals = CurveTotals()
-    totals.add(evaluation)
-    return named_curves(totals, forecasters)
-
-
-def named_curves(totals: CurveTotals, forecasters: Iterable[str]) -> Curves:
-    """The same of curves that have been added up."""
+def mean_curves(totals: CurveTotals, forecasters: Sequence[str]) -> Curves:
+    """Mean curves by name, of sequences that have been scored; offline too where it is known."""
     means = {name: totals.curves(f) for f, name in enumerate(forecasters)}
     if totals.complete:
         means = {"offline": totals.offline, **means}

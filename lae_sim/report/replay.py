@@ -12,7 +12,7 @@ import numpy as np
 
 from lae_sim.comparison.statistics import recovered
 from lae_sim.engine.clock import Clock
-from lae_sim.evaluation.evaluate import Evaluation
+from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.totals import RECOVERED, ScoreTotals, Totals
 from lae_sim.replay.world import SIGMA_GRID
@@ -36,8 +36,8 @@ def trace_report(
     forecasters: Sequence[str],
     sigmas: Sequence[Fraction],
     convention: str,
-    attributes: bool = False,
-    per_sequence: Sequence[Evaluation] = (),
+    per_sequence: SequenceRows | None = None,
+    attributes: bool = True,
 ) -> Report:
     """The figures of one trace as a JSON object (documented in the README).
 
@@ -47,8 +47,8 @@ def trace_report(
         forecasters: names; ``"hold"`` must be among them.
         sigmas: permitted latencies in frames, ascending.
         convention: the convention's name.
-        attributes: whether to report those of each attribute.
-        per_sequence: the scores of each sequence, in groups, if they are to be reported too.
+        per_sequence: each sequence, if they are to be reported too.
+        attributes: whether to report those attributes that the totals know.
     """
     replay, staleness = totals.replay, totals.staleness
     frames, processed = int(replay.frames.sum()), int(replay.processed.sum())
@@ -62,7 +62,6 @@ def trace_report(
         name: (scores.sequences, _scores(scores, forecasters))
         for name, scores in sorted(totals.by_attribute.items() if attributes else ())
     }
-    hold = forecasters.index("hold")
     results = []
     for f, forecaster in enumerate(forecasters):
         means = {}
@@ -89,10 +88,8 @@ def trace_report(
                     name: {"sequences": count, **scores[f][s]}
                     for name, (count, scores) in by_attribute.items()
                 }
-            if per_sequence:
-                result["per_sequence"] = [
-                    row for part in per_sequence for row in _sequence_rows(part, f, s, hold)
-                ]
+            if per_sequence is not None:
+                result["per_sequence"] = per_sequence.of(f, s)
             results.append(result)
     return {
         "sequences": len(replay.sequences),
@@ -141,39 +138,60 @@ def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _sequence_rows(part: Evaluation, f: int, s: int, hold: int) -> Iterator[Report]:
-    """What is reported of each sequence at one sigma; forecasters and sigma by their indices."""
-    replay = part.replay
-    scores = {metric: part.scores[metric][f, :, s].tolist() for metric in METRICS}
-    hold_scores = {metric: part.scores[metric][hold, :, s].tolist() for metric in RECOVERED}
-    offline = {metric: part.offline[metric].tolist() for metric in RECOVERED}
-    columns = zip(
-        replay.sequences,
-        replay.frames.tolist(),
-        replay.processed.tolist(),
-        part.staleness.mismatch_sum[:, s].tolist(),
-        replay.departures.tolist(),
-        replay.disagreement.tolist(),
-    )
-    for i, (name, frames, processed, mismatch, departures, disagreement) in enumerate(columns):
-        shares = {}
-        for metric in RECOVERED:
-            won = scores[metric][i] - hold_scores[metric][i]
-            lost = offline[metric][i] - hold_scores[metric][i]
-            counted = f != hold and math.isfinite(won + lost)
-            shares[f"recovered_{metric}"] = recovered(won, lost) if counted else None
-        yield {
-            "sequence": name,
-            "world_frames": frames,
-            "processed": processed,
-            "mismatch_sum": mismatch,
-            "approximate_outputs": departures,
-            "disagreement": _number(disagreement),
-            "offline_auc": _number(offline["auc"][i]),
-            "offline_dp20": _number(offline["dp20"][i]),
-            **{metric: _number(scores[metric][i]) for metric in METRICS},
-            **shares,
-        }
+class SequenceRows:
+    """What is reported of each sequence, for every forecaster and sigma.
+
+    Attributes:
+        parts: the scores of all sequences, in groups, without their curves.
+    """
+
+    def __init__(self, forecasters: Sequence[str]) -> None:
+        self._hold = forecasters.index("hold")
+        self.parts: list[Evaluation] = []
+
+    def add(self, part: Evaluation) -> None:
+        """Take in a group of sequences; its curves are not kept."""
+        none = Curves(np.empty(0), np.empty(0))
+        self.parts.append(replace(part, curves=none, offline_curves=none))
+
+    def of(self, f: int, s: int) -> list[Report]:
+        """Those of one forecaster and sigma, by their indices."""
+        return [row for part in self.parts for row in self._rows(part, f, s)]
+
+    def _rows(self, part: Evaluation, f: int, s: int) -> Iterator[Report]:
+        replay = part.replay
+        scores = {metric: part.scores[metric][f, :, s].tolist() for metric in METRICS}
+        hold = {metric: part.scores[metric][self._hold, :, s].tolist() for metric in RECOVERED}
+        offline = {metric: part.offline[metric].tolist() for metric in RECOVERED}
+        columns = zip(
+            replay.sequences,
+            replay.frames.tolist(),
+            replay.processed.tolist(),
+            part.staleness.mismatch_sum[:, s].tolist(),
+            replay.departures.tolist(),
+            replay.disagreement.tolist(),
+        )
+        for i, (name, frames, processed, mismatch, departures, disagreement) in enumerate(columns):
+            shares = {}
+            for metric in RECOVERED:
+                won = scores[metric][i] - hold[metric][i]
+                lost = offline[metric][i] - hold[metric][i]
+                share = None
+                if f != self._hold and math.isfinite(won + lost):
+                    share = recovered(won, lost)
+                shares[f"recovered_{metric}"] = share
+            yield {
+                "sequence": name,
+                "world_frames": frames,
+                "processed": processed,
+                "mismatch_sum": mismatch,
+                "approximate_outputs": departures,
+                "disagreement": _number(disagreement),
+                "offline_auc": _number(offline["auc"][i]),
+                "offline_dp20": _number(offline["dp20"][i]),
+                **{metric: _number(scores[metric][i]) for metric in METRICS},
+                **shares,
+            }
 
 
 def attribute_members(metadata: Metadata, sequences: Iterable[str]) -> dict[str, list[int]]:
