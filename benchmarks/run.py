@@ -26,7 +26,7 @@ from lae_sim.forecast.base import ForecasterFactory, Lanes, defines, forecast
 from lae_sim.learning.folds import Examples
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.learning.trainers import NetworkTrainer
-from lae_sim.report.table import table
+from lae_sim.report.table import aligned
 
 SEQUENCES, FRAMES = 123, 112_578
 ELAPSED_NS = 47_000_000
@@ -320,7 +320,7 @@ def main() -> None:
         found = engine_lines(arguments.rounds) + forecaster_lines(arguments.rounds)
         found += process_lines(str(trace), arguments.rounds)
         found += memory_lines(folder, arguments.sequences)
-    print(table(["what", "how", "median", "ratio", "target"], found))
+    print(aligned(["what", "how", "median", "ratio", "target"], found))
 
 
 if __name__ == "__main__":

@@ -127,18 +127,6 @@ def parse_box(text: str) -> tuple[float, ...]:
     return x, y, w, h
 
 
-def parse_stride(text: str) -> Fraction:
-    """A stride of a pass, such as ``2`` or ``3/2``.
-
-    Raises:
-        LaeError: if the text is none.
-    """
-    stride = parse_rational(text)
-    if not (stride > 1 and stride.numerator <= 1000):
-        raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {text!r}")
-    return stride
-
-
 Parsed = TypeVar("Parsed")
 
 

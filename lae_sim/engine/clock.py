@@ -66,6 +66,18 @@ def parse_fps(value: Number) -> Fraction:
     return fps
 
 
+def parse_stride(value: Number) -> Fraction:
+    """Read the stride of a pass (see :mod:`lae_sim.replay.strides`), such as ``2`` or ``3/2``.
+
+    Raises:
+        LaeError: if it is not an exact number above 1, or its numerator is above 1000.
+    """
+    stride = exact(value)
+    if not (stride > 1 and stride.numerator <= 1000):
+        raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {value!r}")
+    return stride
+
+
 def parse_duration(text: str) -> int:
     """Read a duration with its unit (``"47ms"``, ``"0.1s"``) as integer nanoseconds.
 

@@ -24,6 +24,8 @@ from lae_sim.forecast.base import (
     notes_of,
 )
 from lae_sim.replay.run import Run
+from lae_sim.replay.world import World
+from lae_sim.trace.file import Trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +88,29 @@ class Examples:
                 for name in ("frame", "truth", "boxes")
             ),
         )
+
+    @classmethod
+    def of_traces(
+        cls, traces: Iterable[Trace], worlds: Iterable[World], exclude: Collection[str] = ()
+    ) -> Examples:
+        """The examples of replays of each trace in each world.
+
+        Args:
+            traces: better of every frame.
+            worlds: how to replay them.
+            exclude: names of sequences to leave out.
+
+        Raises:
+            LaeError: if a sequence to leave out is not there, or a trace cannot be replayed.
+        """
+        worlds = list(worlds)
+        examples = cls.joined(
+            [cls.of(list(world.replay(trace))) for trace in traces for world in worlds]
+        )
+        absent = sorted(set(exclude) - set(examples.sequences))
+        if absent:
+            raise LaeError(f"--exclude {absent[0]}: there is no such sequence")
+        return examples.without(exclude) if exclude else examples
 
     def without(self, sequences: Collection[str]) -> Examples:
         """All but some sequences: neither their outputs nor their truth is left."""
