@@ -22,7 +22,7 @@ import simpy
 from filterpy.kalman import KalmanFilter
 
 from lae_sim import Clock, Metadata, Recording, Trace, latest, simulate, write_trace
-from lae_sim.forecast.base import ForecasterFactory, Lanes, forecast, own
+from lae_sim.forecast.base import ForecasterFactory, Lanes, defines, forecast
 from lae_sim.learning.folds import Examples
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.learning.trainers import NetworkTrainer
@@ -227,7 +227,7 @@ def forecaster_lines(rounds: int) -> list[list[str]]:
     together = {
         name: partial(forecast, factory, lanes, asked, frames + 3)
         for name, factory in factories.items()
-        if own(factory, "forecast_lanes")
+        if defines(factory, "forecast_lanes")
     }
     for name, work in together.items():
         taken = medians({name: work}, min(rounds, 3))[name] / len(asked) * count

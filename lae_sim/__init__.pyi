@@ -1,5 +1,5 @@
 from .boxes import iou
-from .comparison.forecasters import compare_forecasters
+from .comparison.forecasters import score_forecasters
 from .comparison.statistics import by_attribute, summarise
 from .datasets.frames import Dataset, ImageSequence
 from .datasets.layouts import find_dataset
@@ -13,7 +13,7 @@ from .errors import LaeError, TraceError
 from .evaluation.evaluate import Answers, Evaluation, answers, evaluate
 from .evaluation.events import Event, event_log
 from .evaluation.metrics import CONVENTIONS, Convention, precision_curve, success_curve
-from .evaluation.pairing import SIGMA_GRID, Pairing, pair
+from .evaluation.pairing import Pairing, pair
 from .forecast.base import ConstantVelocity, Forecaster, ForecasterFactory, Hold
 from .forecast.kalman import Kalman, KalmanLaePvt
 from .learning.registry import load_forecaster
@@ -31,8 +31,8 @@ from .replay.latency import (
     resampled,
     scaled,
 )
-from .replay.run import Run, replay_repeated, replay_sequence, replay_trace
-from .replay.world import World
+from .replay.run import Run, replay_repeated, replay_sequence
+from .replay.world import SIGMA_GRID, World, replay_trace
 from .report.comparison import comparison_table
 from .report.film import Scene, draw_frame, film_strip
 from .report.page import write_report
@@ -88,7 +88,6 @@ __all__ = [
     "by_attribute",
     "by_call",
     "by_frame",
-    "compare_forecasters",
     "comparison_table",
     "constant",
     "describe_device",
@@ -118,6 +117,7 @@ __all__ = [
     "run_real_time",
     "run_study",
     "scaled",
+    "score_forecasters",
     "shrinking_tail",
     "simulate",
     "simulate_lanes",

@@ -22,11 +22,11 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import fifo, latest, shrinking_tail, vot_realtime
 from lae_sim.errors import LaeError, TraceError
 from lae_sim.evaluation.evaluate import evaluate
-from lae_sim.evaluation.pairing import SIGMA_GRID
 from lae_sim.forecast.base import Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
 from lae_sim.replay.latency import by_call, by_frame, constant, lognormal, resampled
 from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.trace.file import Trace, read_trace, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
@@ -52,8 +52,8 @@ def use(path: Path) -> Found | None:
         return None
     clock = Clock.at(trace.metadata.fps)
     for recording in recordings:
-        for source in (by_frame, by_call, constant(1), resampled(1), lognormal(1)):
-            for policy in (latest, fifo, shrinking_tail(50_000_000), vot_realtime()):
+        for source in (by_frame, by_call, constant(ns=1), resampled(1), lognormal(1)):
+            for policy in (latest, fifo, shrinking_tail(ns=50_000_000), vot_realtime()):
                 with suppress(LaeError):
                     run = replay_sequence(recording, clock, source, policy)
                     if source is by_frame and policy is latest:
@@ -465,7 +465,7 @@ def test_any_time_at_any_rate_is_replayed_or_refused(elapsed: int, fps: str) -> 
     boxes = np.ones((5, 4))
     recording = Recording.new("a", boxes, boxes, [elapsed] * 5)
     metadata = Metadata.new(fps, "every-frame")
-    for policy in (latest, fifo, shrinking_tail(elapsed), vot_realtime()):
+    for policy in (latest, fifo, shrinking_tail(ns=elapsed), vot_realtime()):
         with suppress(LaeError):
             run = replay_sequence(recording, Clock.at(Fraction(fps)), policy=policy)
             evaluate([scored_at_arrival(run)], metadata, {"k": Kalman}, SIGMA_GRID)

@@ -11,10 +11,10 @@ import pytest
 
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.evaluate import Evaluation, evaluate
-from lae_sim.evaluation.pairing import SIGMA_GRID
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import by_frame, constant, scaled
 from lae_sim.replay.run import replay_sequence
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.run import run_study
 from lae_sim.study.spec import Study
 from lae_sim.trace.file import Trace, read_trace, write_trace
@@ -104,7 +104,7 @@ def test_nanotrack_on_dtb70_at_47_ms(nanotrack: Trace) -> None:
 
 
 def test_nanotrack_over_the_grid_of_permitted_latencies(nanotrack: Trace) -> None:
-    source = constant(47_000_000)
+    source = constant(ns=47_000_000)
     runs = [replay_sequence(recording, CLOCK, source) for recording in nanotrack]
     found = evaluate(runs, METADATA, FORECASTERS, SIGMA_GRID)
     assert means(found) == {"hold": (0.4560, 0.6086), "kalman": (0.5485, 0.7475)}
@@ -139,7 +139,7 @@ def test_studies_reach_the_same_figures_in_batches(
 
 
 def test_offline_values_do_not_depend_on_latency(nanotrack: Trace) -> None:
-    runs = [replay_sequence(r, CLOCK, constant(0)) for r in list(nanotrack)[:5]]
+    runs = [replay_sequence(r, CLOCK, constant(ns=0)) for r in list(nanotrack)[:5]]
     found = evaluate(runs, METADATA, FORECASTERS)
     for metric, offline in found.offline.items():
         assert found.scores[metric][0, :, 0].tolist() == offline.tolist()

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 import simpy
 from hypothesis import strategies as st
 
-from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.trace.recording import Recording
 
 with warnings.catch_warnings():

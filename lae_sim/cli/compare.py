@@ -8,7 +8,14 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.cli.options import add_forecasting, add_worlds, argument, exit_status, new_parser
+from lae_sim.cli.options import (
+    add_forecasting,
+    add_worlds,
+    argument,
+    exit_status,
+    new_parser,
+    worlds_of,
+)
 from lae_sim.engine.clock import parse_rational, whole
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, check_folders, labels
@@ -149,30 +156,23 @@ def _table(
     """Compare, with a progress bar if the standard error stream is a terminal."""
     from tqdm import tqdm
 
-    from lae_sim.cli.options import parse_world
-    from lae_sim.comparison.forecasters import compare_forecasters, steps
-    from lae_sim.evaluation.metrics import find_convention
-    from lae_sim.evaluation.pairing import SIGMA_GRID
+    from lae_sim.comparison.forecasters import score_forecasters, steps
 
-    world = parse_world(arguments)
-    sigmas = SIGMA_GRID if arguments.sigma_grid else sorted(set(arguments.sigma))
-    total = steps(traces, forecasters, world, arguments.folds)
+    worlds = worlds_of(
+        arguments,
+        sigma="grid" if arguments.sigma_grid else arguments.sigma,
+        convention=arguments.convention,
+        costs=arguments.cost,
+    )
+    total = steps(traces, forecasters, worlds, arguments.folds)
     with tqdm(total=total, unit=" steps", disable=None) as bar:
 
         def progress(what: str) -> None:
             bar.set_description(what, refresh=False)
             bar.update()
 
-        return compare_forecasters(
-            traces,
-            forecasters,
-            world,
-            sigmas,
-            find_convention(arguments.convention),
-            arguments.cost,
-            arguments.folds,
-            arguments.seed,
-            progress,
+        return score_forecasters(
+            traces, forecasters, worlds, arguments.folds, arguments.seed, progress
         )
 
 

@@ -5,22 +5,18 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import argument, exit_status
-from lae_sim.engine.clock import Clock, parse_fps
+from lae_sim.cli.options import argument, exit_status, new_parser
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct
-from lae_sim.importers.convert import (
-    every_frame,
-    figures,
-    listed,
-    matched_results,
-    real_time,
-    sequence_entries,
-)
+from lae_sim.progress import ProgressBar
+
+if TYPE_CHECKING:
+    from lae_sim.importers.convert import ConversionSummary
 
 _FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "npz", "lae-pvt")
 _EXAMPLES = """\
@@ -49,11 +45,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="lae-sim convert",
-        description="Make a trace from a tracker's results and the dataset's ground truth.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = new_parser(
+        "lae-sim convert",
+        "Make a trace from a tracker's results and the dataset's ground truth.",
+        _EXAMPLES,
     )
     add = parser.add_argument
     add("results", type=Path, metavar="RESULTS", help="folder of one tracker's results, or a file")
@@ -93,78 +88,58 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _convert(arguments: argparse.Namespace) -> None:
-    from lae_sim.datasets.annotations import find_truth, read_attributes
-    from lae_sim.importers.results import find_results, given_times, tracker_name
-    from lae_sim.trace.file import Trace, write_trace
-    from lae_sim.trace.metadata import Metadata
+    from lae_sim.importers.convert import convert_results
+    from lae_sim.trace.file import write_trace
 
-    if arguments.repetition < 1:
-        raise LaeError("--repetition counts from 1")
-    check_distinct([arguments.out], [arguments.results, *(p for _, p in arguments.truth_file)])
-    kind, sources = find_results(arguments.results, arguments.format, arguments.repetition)
-    truth = find_truth(arguments.truth).with_files(dict(arguments.truth_file))
-    matched, skipped = matched_results(kind, sources, truth, arguments)
-    dataset = arguments.dataset or truth.dataset
-    fps = arguments.fps or ("10" if "10fps" in dataset.lower() else "30")
-    clock = Clock.at(parse_fps(fps))
-    tracker = arguments.tracker or tracker_name(kind, arguments.results, matched)
-    given = given_times(arguments.time, tracker)
-    if kind == "lae-pvt":
-        if given:
-            raise LaeError("--time does not go with lae-pvt, whose runs hold their own times")
-        recordings, timing = real_time(matched, truth, clock)
+    truth_files = dict(arguments.truth_file)
+    check_distinct([arguments.out], [arguments.results, *truth_files.values()])
+    with closing(ProgressBar("convert", "sequences")) as bar:
+        trace, summary = convert_results(
+            arguments.results,
+            arguments.truth,
+            format=arguments.format,
+            fps=arguments.fps,
+            time=arguments.time,
+            time_unit=arguments.time_unit,
+            repetition=arguments.repetition,
+            tracker=arguments.tracker,
+            device=arguments.device,
+            dataset=arguments.dataset,
+            sequences=arguments.sequence,
+            exclude=arguments.exclude,
+            truth_files=truth_files,
+            skip_missing=arguments.skip_missing,
+            image_size=arguments.image_size,
+            progress=bar,
+        )
+    check_distinct([arguments.out], summary.files)
+    write_trace(trace, arguments.out)
+    if arguments.json:
+        print(json.dumps(summary.document(arguments.out), indent=2))
     else:
-        recordings, timing = every_frame(kind, matched, truth, given, arguments)
-    about = {
-        "tracker": {"name": tracker},
-        "device": {"model": arguments.device} if arguments.device else {},
-        "dataset": {"name": dataset},
-        "timing": timing,
-        "sequences": sequence_entries(matched, read_attributes(truth), arguments.image_size),
-    }
-    if kind == "lae-pvt":
-        metadata = Metadata.new(fps, "real-time", schedule={"policy": "latest"}, **about)
-    else:
-        metadata = Metadata.new(fps, "every-frame", **about)
-    read = [file for source in matched.values() for file in (source.path, source.times) if file]
-    check_distinct([arguments.out], [*read, *truth.files.values()])
-    write_trace(Trace(metadata, recordings), arguments.out)
-    left_out = {*matched, *arguments.exclude}
-    unmatched = [name for name in truth.files if name not in left_out]
-    summary = {
-        "trace": str(arguments.out),
-        "format": kind,
-        "schedule": metadata.kind,
-        "fps": fps,
-        "tracker": tracker,
-        "dataset": dataset,
-        "timing": timing,
-        **figures(recordings),
-        "without_truth": skipped,
-        "without_results": [] if arguments.sequence else unmatched,
-    }
-    print(json.dumps(summary, indent=2) if arguments.json else _text(summary))
+        print(_text(summary, arguments.out))
 
 
-def _text(summary: Mapping[str, Any]) -> str:
+def _text(summary: ConversionSummary, out: Path) -> str:
     """The summary for people."""
-    timing = summary["timing"]
+    from lae_sim.importers.convert import listed
+
     processed = "every frame"
-    if summary["schedule"] == "real-time":
-        processed = f"in real time, {summary['processed']:,} processed"
+    if summary.schedule == "real-time":
+        processed = f"in real time, {summary.processed:,} processed"
     lines = [
-        f"{summary['trace']}: {summary['tracker']} on {summary['dataset']}, "
-        f"{summary['sequences']} sequences, {summary['frames']:,} frames at {summary['fps']} fps, "
-        f"{processed}; median {_milliseconds(summary['median_ms'])} a frame. "
-        f"Read as {summary['format']}; times: {timing['source']}."
+        f"{out}: {summary.tracker} on {summary.dataset}, {summary.sequences} sequences, "
+        f"{summary.frames:,} frames at {summary.fps} fps, {processed}; "
+        f"median {_milliseconds(summary.median_ms)} a frame. "
+        f"Read as {summary.format}; times: {summary.timing['source']}."
     ]
-    if "note" in timing:
-        lines.append(f"Note: {timing['note']}.")
-    if summary["without_truth"]:
-        lines.append(f"Left out, without ground truth: {listed(summary['without_truth'])}.")
-    if summary["without_results"]:
-        lines.append(f"Without results: {listed(summary['without_results'])}.")
-    return "\n".join([*lines, f"Next: lae-sim replay {summary['trace']}"])
+    if "note" in summary.timing:
+        lines.append(f"Note: {summary.timing['note']}.")
+    if summary.without_truth:
+        lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
+    if summary.without_results:
+        lines.append(f"Without results: {listed(summary.without_results)}.")
+    return "\n".join([*lines, f"Next: lae-sim replay {out}"])
 
 
 def _milliseconds(ms: float) -> str:

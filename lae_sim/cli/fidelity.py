@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict
+from typing import Any
 
 from lae_sim.cli.options import exit_status, new_parser
-
-if TYPE_CHECKING:
-    from lae_sim.comparison.fidelity import Row
 
 PROGRAM = "lae-sim fidelity"
 
@@ -52,19 +50,22 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     import json
 
     from lae_sim import __version__
-    from lae_sim.comparison.fidelity import GROUP, compared, summarised
+    from lae_sim.comparison.fidelity import compare_closed_loops, summarise_closed_loops
 
-    closed_loops = dict.fromkeys(arguments.closed_loop)
-    rows = [row for path in closed_loops for row in compared(path, arguments)]
-    groups: dict[tuple[str, ...], list[Row]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[key] for key in GROUP), []).append(row)
-    summary = [dict(zip(GROUP, key)) | summarised(group) for key, group in groups.items()]
+    rows = compare_closed_loops(
+        arguments.trace,
+        arguments.closed_loop,
+        passes=arguments.strided,
+        forecasters=arguments.forecaster,
+        convention=arguments.convention,
+    )
+    summary = summarise_closed_loops(rows)
     if arguments.json:
         head = {"format": "lae-fidelity", "version": "1.0", "lae_sim": __version__}
         settings = {"trace": arguments.trace, "strided": arguments.strided}
         settings["convention"] = arguments.convention
-        print(json.dumps({**head, **settings, "summary": summary, "sequences": rows}, indent=2))
+        parts = {"summary": list(map(asdict, summary)), "sequences": list(map(asdict, rows))}
+        print(json.dumps({**head, **settings, **parts}, indent=2))
         return
     from lae_sim.report.comparison import fidelity_table
 

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lae_sim.engine.clock import parse_fps, parse_rational, whole
 from lae_sim.errors import LaeError
@@ -127,18 +127,6 @@ def parse_box(text: str) -> tuple[float, ...]:
     return x, y, w, h
 
 
-def parse_stride(text: str) -> Fraction:
-    """A stride of a pass, such as ``2`` or ``3/2``.
-
-    Raises:
-        LaeError: if the text is none.
-    """
-    stride = parse_rational(text)
-    if not (stride > 1 and stride.numerator <= 1000):
-        raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {text!r}")
-    return stride
-
-
 Parsed = TypeVar("Parsed")
 
 
@@ -186,17 +174,24 @@ def exit_status(work: Callable[[], None], program: str) -> int:
     return 0
 
 
-def parse_world(arguments: argparse.Namespace) -> World:
-    """How traces are replayed, from the arguments of :func:`lae_sim.cli.options.add_worlds`.
+def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]:
+    """The worlds that the options of :func:`add_world` or :func:`add_worlds` name, in their order.
+
+    Args:
+        arguments: what argparse made of the command line.
+        scores: what else a world has (see :meth:`lae_sim.replay.world.World.of`).
 
     Raises:
-        LaeError: if there is no such policy or latency.
+        LaeError: if there is no such policy or latency, or some do not go together.
     """
-    from lae_sim.replay.world import World, parse_latency, parse_policy
+    from lae_sim.replay.world import World
 
-    return World(
-        {name: parse_latency(name) for name in dict.fromkeys(arguments.latency)},
-        list(dict.fromkeys(arguments.latency_scale)),
-        arguments.fps,
-        parse_policy(arguments.policy),
+    return World.sweep(
+        fps=arguments.fps,
+        policy=arguments.policy,
+        latency=arguments.latency,
+        scale=arguments.latency_scale,
+        timing=getattr(arguments, "timing", None),
+        passes=getattr(arguments, "strided", ()),
+        **scores,
     )

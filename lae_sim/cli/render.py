@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import add_world, exit_status, new_parser
+from lae_sim.cli.options import add_world, exit_status, new_parser, worlds_of
 from lae_sim.errors import LaeError
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.report.film import Scene
@@ -108,18 +108,9 @@ def _render(arguments: argparse.Namespace) -> None:
 
 def _replayed(arguments: argparse.Namespace) -> tuple[Metadata, list[Run]]:
     """The metadata of the trace, and its sequences replayed."""
-    from lae_sim.replay.latency import scaled
-    from lae_sim.replay.run import replay_trace
-    from lae_sim.replay.world import parse_latency, parse_policy
-    from lae_sim.trace.file import read_trace
-
-    policy = parse_policy(arguments.policy)
-    source = scaled(parse_latency(arguments.latency), arguments.latency_scale)
-    trace = read_trace(arguments.trace, arguments.sequence)
-    timing = read_trace(arguments.timing) if arguments.timing else None
-    strided = [read_trace(path, arguments.sequence) for path in arguments.strided]
-    runs = replay_trace(trace, arguments.fps, source, policy, timing, strided)
-    return trace.metadata, list(runs)
+    (world,) = worlds_of(arguments)
+    runs = world.replay(arguments.trace, arguments.sequence)
+    return runs.trace.metadata, list(runs)
 
 
 def _images(run: Run, metadata: Metadata, arguments: argparse.Namespace) -> ImageSequence:

@@ -7,20 +7,25 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import add_forecasting, add_world, argument, exit_status, new_parser
+from lae_sim.cli.options import (
+    add_forecasting,
+    add_world,
+    argument,
+    exit_status,
+    new_parser,
+    worlds_of,
+)
 from lae_sim.engine.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, labels
 from lae_sim.learning.registry import FORECASTERS, find_camera, load_forecaster
 
 if TYPE_CHECKING:
-    from lae_sim.engine.clock import Clock
-    from lae_sim.evaluation.metrics import Convention
     from lae_sim.forecast.base import AnyFactory
-    from lae_sim.replay.run import Run
+    from lae_sim.replay.run import Run, Runs
+    from lae_sim.replay.world import World
     from lae_sim.report.replay import Report
     from lae_sim.trace.file import Trace
 
@@ -115,7 +120,8 @@ def _replay(arguments: argparse.Namespace) -> None:
     import json
 
     from lae_sim import __version__
-    from lae_sim.evaluation.pairing import SIGMA_GRID
+    from lae_sim.engine.scheduler import scores_latency
+    from lae_sim.replay.world import SIGMA_GRID
     from lae_sim.trace.locate import find_traces
 
     if arguments.eta is not None:
@@ -127,8 +133,17 @@ def _replay(arguments: argparse.Namespace) -> None:
     _check_files(arguments, swept)
     shown = sorted({float(sigma) for sigma in arguments.sigma})
     sigmas = sorted({*arguments.sigma, *(SIGMA_GRID if arguments.sigma_grid else ())})
+    worlds = worlds_of(
+        arguments,
+        sigma=sigmas,
+        convention=arguments.convention,
+        forecasters=["hold", *arguments.forecaster],
+        costs=arguments.cost,
+    )
+    if arguments.timeline and not scores_latency(worlds[0].rule()):
+        raise LaeError(f"{arguments.policy} never scores latency: it goes with no --timeline")
     named = zip(arguments.traces, labels(arguments.traces))
-    jobs = [job for path, label in named for job in jobs_of(path, label, arguments, sigmas)]
+    jobs = [job for path, label in named for job in jobs_of(path, label, worlds, arguments)]
     if arguments.plot:
         from lae_sim.report.style import check_format
 
@@ -173,7 +188,7 @@ def _sinks(
     sinks: list[Callable[[Run], None]] = []
     answer_sinks: list[export.AnswerSink] = []
     if arguments.schedule:
-        sinks.append(files.enter_context(export.schedule_file(arguments.schedule, job.clock)))
+        sinks.append(files.enter_context(export.schedule_file(arguments.schedule, job.runs.clock)))
     if arguments.events:
         events = export.events_file(arguments.events, arguments.sigma[0])
         sinks.append(files.enter_context(events))
@@ -211,13 +226,14 @@ def _plot(
     from pathlib import Path
 
     from lae_sim.evaluation.evaluate import evaluate
+    from lae_sim.evaluation.metrics import find_convention
     from lae_sim.report import figures
     from lae_sim.report.export import sigma_text
     from lae_sim.report.style import save
 
     sigma, several = arguments.sigma[0], len(arguments.traces) > 1
     title = "" if several else f"{jobs[0].label}: "
-    title += f"sigma {sigma_text(sigma)}, convention {jobs[0].convention.name}"
+    title += f"sigma {sigma_text(sigma)}, convention {jobs[0].world.convention}"
     if swept:
         names = [job.label for job in jobs]
         save(figures.sweep_figure(reports, names, float(sigma), swept, title), arguments.plot)
@@ -225,11 +241,11 @@ def _plot(
     named: figures.Curves = {}
     for job in jobs:
         evaluation = evaluate(
-            job.runs(),
+            job.runs,
             job.trace.metadata,
             job.forecasters,
             [sigma],
-            job.convention,
+            find_convention(job.world.convention),
             job.costs,
         )
         found = figures.mean_curves(evaluation, job.forecasters)
@@ -264,86 +280,53 @@ def _print_tables(
 
 @dataclass(frozen=True)
 class Job:
-    """One trace and how it is replayed and scored.
+    """One trace in one world.
 
     Attributes:
         path: the trace's file.
         label: its name in tables and pictures.
         trace: the trace.
-        timing: the trace that the times come from, if it is another.
-        clock: the world's clock.
-        scale: exact factor on all times.
-        runs: replays the sequences, from the first, each time it is called.
+        world: how it is replayed and scored.
+        runs: the sequences, replayed from the first each time one goes through them.
         forecasters: factories by name; hold, the baseline of all comparisons, is always there.
         costs: what an answer of each forecaster costs, ns.
-        sigmas: permitted latencies, ascending.
-        convention: how frames and thresholds count.
     """
 
     path: str
     label: str
     trace: Trace
-    timing: Trace | None
-    clock: Clock
-    scale: Fraction
-    runs: Callable[[], Iterator[Run]]
+    world: World
+    runs: Runs
     forecasters: Mapping[str, AnyFactory]
     costs: Mapping[str, int]
-    sigmas: Sequence[Fraction]
-    convention: Convention
 
 
 def jobs_of(
-    path: str, label: str, arguments: argparse.Namespace, sigmas: Sequence[Fraction]
+    path: str, label: str, worlds: Sequence[World], arguments: argparse.Namespace
 ) -> Iterator[Job]:
-    """The jobs of one trace: for each frame rate, one for each scale of the times."""
-    from lae_sim.engine.clock import Clock
-    from lae_sim.engine.scheduler import scores_latency
+    """The jobs of one trace, one for each world."""
     from lae_sim.evaluation.metrics import find_convention
     from lae_sim.forecast.costs import resolve_costs
-    from lae_sim.replay.latency import scaled
-    from lae_sim.replay.run import replay_trace
-    from lae_sim.replay.world import parse_latency, parse_policy
     from lae_sim.trace.file import read_trace
 
-    policy = parse_policy(arguments.policy)
-    at_arrival = not scores_latency(policy)
-    if at_arrival and any(sigmas):
-        raise LaeError("vot-realtime never scores latency: it goes with no permitted latency")
-    if at_arrival and arguments.cost:
-        raise LaeError("vot-realtime never scores latency: it goes with no --cost")
-    if at_arrival and arguments.timeline:
-        raise LaeError("vot-realtime never scores latency: it goes with no --timeline")
-    latency = parse_latency(arguments.latency)
+    find_convention(arguments.convention)
     trace = read_trace(path, arguments.sequence)
-    timing = read_trace(arguments.timing) if arguments.timing else None
-    strided = [read_trace(pass_, arguments.sequence) for pass_ in arguments.strided]
     if arguments.attributes and not trace.metadata.names_attributes:
         raise LaeError(f"{path}: the trace names no attributes of its sequences")
-    names = dict.fromkeys(["hold", *arguments.forecaster])
     costs: dict[str, int] | None = None
-    for fps in arguments.fps or [trace.metadata.fps]:
+    for world in worlds:
+        runs = world.replay(trace, arguments.sequence)
         camera = find_camera(
-            arguments.root, arguments.dataset, arguments.sequence, fps, arguments.camera_lag
+            arguments.root,
+            arguments.dataset,
+            arguments.sequence,
+            runs.clock.fps,
+            arguments.camera_lag,
         )
-        forecasters = {name: load_forecaster(name, camera) for name in names}
+        forecasters = {name: load_forecaster(name, camera) for name in world.forecasters}
         if costs is None:  # measured once: a sweep is of nothing else
-            costs = resolve_costs(arguments.cost, forecasters, trace)
-        for scale in arguments.latency_scale:
-            source = scaled(latency, scale)
-            yield Job(
-                path=path,
-                label=label,
-                trace=trace,
-                timing=timing,
-                clock=Clock.at(fps),
-                scale=scale,
-                runs=partial(replay_trace, trace, fps, source, policy, timing, strided),
-                forecasters=forecasters,
-                costs=costs,
-                sigmas=sigmas,
-                convention=find_convention(arguments.convention),
-            )
+            costs = resolve_costs(world.costs, forecasters, trace)
+        yield Job(path, label, trace, world, runs, forecasters, costs)
 
 
 def report(
@@ -352,23 +335,25 @@ def report(
     """Replay and score one trace, giving each run to the sinks."""
     from lae_sim.evaluation.caveats import SkippedStalls, notes_on
     from lae_sim.evaluation.evaluate import evaluate
+    from lae_sim.evaluation.metrics import find_convention
     from lae_sim.forecast.costs import cost_notes
     from lae_sim.report.replay import attribute_members, trace_report
 
     metadata = job.trace.metadata
     stalls = SkippedStalls()
-    if arguments.latency == "recorded" and job.timing is None:
+    if job.world.latency == "recorded" and job.world.timing is None:
         sinks = [*sinks, stalls]
-    runs = _written(_progress(job.runs(), job.path, job.trace.frames), sinks)
-    evaluation = evaluate(runs, metadata, job.forecasters, job.sigmas, job.convention, job.costs)
+    runs = _written(_progress(job.runs, job.path, job.trace.frames), sinks)
+    convention = find_convention(job.world.convention)
+    evaluation = evaluate(runs, metadata, job.forecasters, job.world.sigmas, convention, job.costs)
     members = attribute_members(metadata, evaluation.sequences)
-    notes = notes_on(evaluation, metadata, job.convention, job.forecasters)
+    notes = notes_on(evaluation, metadata, convention, job.forecasters)
     figures = trace_report(
         evaluation,
-        job.clock,
+        job.runs.clock,
         list(job.forecasters),
-        job.sigmas,
-        job.convention.name,
+        job.world.sigmas,
+        job.world.convention,
         members if arguments.attributes else None,
         arguments.per_sequence,
     )
@@ -379,12 +364,12 @@ def report(
         "device": metadata.device,
         "strided": arguments.strided,
         "times_from": arguments.timing or job.path,
-        "times_note": (job.timing or job.trace).metadata.timing_note,
-        "fps": str(job.clock.fps),
+        "times_note": (job.runs.timing or job.trace).metadata.timing_note,
+        "fps": str(job.runs.clock.fps),
         "policy": arguments.policy,
         "latency": arguments.latency,
-        "latency_scale": str(job.scale),
-        "convention": job.convention.name,
+        "latency_scale": str(job.world.scale),
+        "convention": job.world.convention,
         "forecaster_cost_ns": dict(job.costs),
         "notes": [*notes, *stalls.notes(), *cost_notes(job.costs)],
         **figures,

@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 
-from lae_sim.cli.options import exit_status
+from lae_sim.cli.options import exit_status, new_parser
 
 _EXAMPLES = """\
 examples:
@@ -19,11 +19,10 @@ examples:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim show``; see ``--help``."""
-    parser = argparse.ArgumentParser(
-        prog="lae-sim show",
-        description="Say what a trace holds, and how its processing times are distributed.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = new_parser(
+        "lae-sim show",
+        "Say what a trace holds, and how its processing times are distributed.",
+        _EXAMPLES,
     )
     add = parser.add_argument
     add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
@@ -41,20 +40,20 @@ def _show(arguments: argparse.Namespace) -> None:
     from lae_sim.trace.file import read_trace
     from lae_sim.trace.locate import find_traces
 
-    arguments.traces = find_traces(arguments.traces)
+    paths = find_traces(arguments.traces)
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="replace")  # a name may have what the terminal has not
     if arguments.plot:
         from lae_sim.report.style import check_format
 
-        check_distinct([arguments.plot], arguments.traces)
+        check_distinct([arguments.plot], paths)
         check_format(arguments.plot)
-    found = [describe(read_trace(path), path) for path in arguments.traces]
-    reports = [report for report, _ in found]
+    described = [describe(read_trace(path), path) for path in paths]
+    reports = [report for report, _ in described]
     if arguments.json:
         document = {"format": "lae-show", "version": "1.0", "lae_sim": __version__}
         print(json.dumps({**document, "traces": reports}, indent=2, allow_nan=False))
     else:
         print("\n\n".join(map(overview, reports)))
     if arguments.plot:
-        plot_times(found, arguments.plot)
+        plot_times(described, arguments.plot)

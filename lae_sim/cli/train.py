@@ -9,7 +9,6 @@ from functools import partial
 
 from lae_sim.cli.options import add_worlds, argument, exit_status, new_parser
 from lae_sim.engine.clock import whole
-from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, check_folders
 
 PROGRAM = "lae-sim train"
@@ -62,31 +61,25 @@ def _train(arguments: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from lae_sim import __version__
-    from lae_sim.cli.options import parse_world
+    from lae_sim.cli.options import worlds_of
     from lae_sim.forecast.learned import Learned, write_learned
     from lae_sim.learning.folds import Examples
     from lae_sim.learning.trainers import NetworkTrainer
     from lae_sim.trace.file import read_trace
     from lae_sim.trace.locate import find_traces
 
-    arguments.traces = find_traces(arguments.traces)
-    check_distinct([arguments.out], arguments.traces)
+    paths = find_traces(arguments.traces)
+    check_distinct([arguments.out], paths)
     check_folders([arguments.out])
-    world = parse_world(arguments)
-    traces = [read_trace(path, arguments.sequence) for path in arguments.traces]
-    examples = Examples.joined(
-        [Examples.of(runs) for trace in traces for *_, runs in world.replays(trace)]
-    )
-    absent = sorted(set(arguments.exclude) - set(examples.sequences))
-    if absent:
-        raise LaeError(f"--exclude {absent[0]}: there is no such sequence")
-    examples = examples.without(arguments.exclude)
+    worlds = worlds_of(arguments)
+    traces = [read_trace(path, arguments.sequence) for path in paths]
+    examples = Examples.of_traces(traces, worlds, arguments.exclude)
     with tqdm(total=arguments.steps, desc="training", unit=" steps", disable=None) as bar:
         trainer = NetworkTrainer(steps=arguments.steps, progress=bar.update)
         rule = trainer.fit(examples, arguments.seed).rule
     made = {
         "lae_sim": __version__,
-        "traces": arguments.traces,
+        "traces": paths,
         "latencies": arguments.latency,
         "scales": [str(scale) for scale in arguments.latency_scale],
         "policy": arguments.policy,

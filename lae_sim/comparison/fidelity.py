@@ -1,38 +1,135 @@
-"""How far replays are from closed loops."""
+"""How far replays are from closed loops, in which the tracker really skipped frames."""
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
-from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from lae_sim._arrays import Floats
+from lae_sim.boxes import PARTED_IOU, iou
+from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
+from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.metrics import Convention, find_convention
+from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import load_forecaster
+from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import parse_policy
-
-if TYPE_CHECKING:
-    from lae_sim.evaluation.evaluate import Evaluation
-    from lae_sim.replay.run import Run
-    from lae_sim.trace.file import Trace
+from lae_sim.trace.file import Trace, read_trace
 
 
-Row = dict[str, Any]
+@dataclass(frozen=True)
+class FidelityRow:
+    """One sequence of a closed loop, and a replay of it.
+
+    Attributes:
+        closed_loop: path of the closed loop's trace.
+        forecaster: its name.
+        replay: which boxes were replayed: ``"every-frame"`` or ``"strided"``.
+        sequence: its name.
+        closed_auc, auc, d_auc: of the closed loop, of the replay, and replay - closed loop.
+        closed_dp20, dp20, d_dp20: the same of the precision at 20 pixels.
+        parted: the first processed frame whose boxes overlap less than half; None if none does.
+        approximate_outputs: outputs of the replay after another number of skipped frames than
+            in the traces.
+        disagreement: of the strides (see :class:`lae_sim.replay.run.Run`); None where there is
+            none.
+    """
+
+    closed_loop: str
+    forecaster: str
+    replay: str
+    sequence: str
+    closed_auc: float
+    auc: float
+    d_auc: float
+    closed_dp20: float
+    dp20: float
+    d_dp20: float
+    parted: int | None
+    approximate_outputs: int
+    disagreement: float | None
 
 
-GROUP = ("closed_loop", "forecaster", "replay")
+@dataclass(frozen=True)
+class FidelitySummary:
+    """All sequences of a closed loop, and a replay of them.
+
+    Attributes:
+        closed_loop, forecaster, replay: as of the rows.
+        sequences: how many.
+        closed_auc, auc, closed_dp20, dp20: means over the sequences that have a score.
+        mean_abs_d_auc, median_abs_d_auc, max_abs_d_auc: of ``|d_auc|`` over these.
+        mean_abs_d_dp20, median_abs_d_dp20, max_abs_d_dp20: of ``|d_dp20|`` over these.
+    """
+
+    closed_loop: str
+    forecaster: str
+    replay: str
+    sequences: int
+    closed_auc: float
+    auc: float
+    mean_abs_d_auc: float
+    median_abs_d_auc: float
+    max_abs_d_auc: float
+    closed_dp20: float
+    dp20: float
+    mean_abs_d_dp20: float
+    median_abs_d_dp20: float
+    max_abs_d_dp20: float
 
 
-def compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
-    """One closed loop against replays at its times: a row per forecaster, replay and sequence."""
-    import numpy as np
+def compare_closed_loops(
+    trace: str,
+    closed_loops: Sequence[str],
+    *,
+    passes: Sequence[str] = (),
+    forecasters: Sequence[str] = ("hold",),
+    convention: str = "pysot",
+) -> list[FidelityRow]:
+    """Compare closed loops with replays at their times.
 
-    from lae_sim.evaluation.evaluate import evaluate
-    from lae_sim.evaluation.metrics import find_convention
-    from lae_sim.replay.run import replay_trace
-    from lae_sim.trace.file import read_trace
+    Args:
+        trace: path of a trace of every frame.
+        closed_loops: paths of real-time traces of the same tracker.
+        passes: paths of traces of passes on every N-th frame.
+        forecasters: names (see :func:`lae_sim.learning.registry.load_forecaster`).
+        convention: how frames and thresholds count, by name.
 
+    Returns:
+        A row per closed loop, replay, forecaster and sequence; the replay ``"strided"`` is there
+        if ``passes`` are given.
+
+    Raises:
+        LaeError: if a trace cannot be read, is not of the kind needed or of another tracker, or
+            there is no such forecaster or convention.
+    """
+    factories = {name: load_forecaster(name) for name in forecasters}
+    scoring = find_convention(convention)
+    return [
+        row
+        for path in dict.fromkeys(closed_loops)
+        for row in _rows(path, [trace, *passes], factories, scoring)
+    ]
+
+
+def summarise_closed_loops(rows: Sequence[FidelityRow]) -> list[FidelitySummary]:
+    """The rows of each closed loop, forecaster and replay in short."""
+    groups: dict[tuple[str, str, str], list[FidelityRow]] = {}
+    for row in rows:
+        groups.setdefault((row.closed_loop, row.forecaster, row.replay), []).append(row)
+    return [_summary(*key, group) for key, group in groups.items()]
+
+
+def _rows(
+    path: str,
+    replayed: Sequence[str],
+    forecasters: Mapping[str, AnyFactory],
+    convention: Convention,
+) -> Iterator[FidelityRow]:
     closed = read_trace(path)
     if closed.metadata.kind != "real-time":
         raise LaeError(
@@ -40,46 +137,48 @@ def compared(path: str, arguments: argparse.Namespace) -> Iterator[Row]:
             "'lae-sim profile --closed-loop' or '--mode real-time' left"
         )
     names = [recording.name for recording in closed]
-    every, *strided = (read_trace(other, names) for other in [arguments.trace, *arguments.strided])
-    for trace in (every, *strided):
+    every, *passes = (read_trace(other, names) for other in replayed)
+    for trace in (every, *passes):
         _check_same_tracker(closed, trace)
         if trace.metadata.kind != "every-frame":
             raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
     schedule = closed.metadata.document["schedule"]
     policy = parse_policy(schedule.get("policy", "latest"))
-    forecasters = {name: load_forecaster(name) for name in arguments.forecaster}
-    convention = find_convention(arguments.convention)
 
-    def scored(runs: list[Run]) -> Evaluation:
-        return evaluate(runs, closed.metadata, forecasters, (Fraction(0),), convention)
+    def scores(runs: list[Run]) -> Mapping[str, Floats]:
+        sigmas = (Fraction(0),)
+        return evaluate(runs, closed.metadata, forecasters, sigmas, convention).scores
 
-    replay = partial(replay_trace, every, closed.metadata.fps, policy=policy, timing=closed)
-    truth = list(replay_trace(closed, policy=policy))
-    replays = {"every-frame": list(replay())}
-    if strided:
-        replays["strided"] = list(replay(strided=strided))
-    reference = scored(truth)
+    clock = Clock.at(closed.metadata.fps)
+    closed_runs = list(Runs(closed, clock, policy=policy))
+    replays = {"every-frame": list(Runs(every, clock, policy=policy, timing=closed))}
+    if passes:
+        strided = Runs(every, clock, policy=policy, timing=closed, passes=tuple(passes))
+        replays["strided"] = list(strided)
+    closed_scores = scores(closed_runs)
     for kind, runs in replays.items():
-        found = scored(runs)
+        replay_scores = scores(runs)
         for f, forecaster in enumerate(forecasters):
-            for i, (run, closed_run) in enumerate(zip(runs, truth)):
-                auc, dp = (found.scores[m][f, i, 0] for m in ("auc", "dp20"))
-                closed_auc, closed_dp = (reference.scores[m][f, i, 0] for m in ("auc", "dp20"))
-                yield {
-                    "closed_loop": path,
-                    "forecaster": forecaster,
-                    "replay": kind,
-                    "sequence": run.recording.name,
-                    "closed_auc": float(closed_auc),
-                    "auc": float(auc),
-                    "d_auc": float(auc - closed_auc),
-                    "closed_dp20": float(closed_dp),
-                    "dp20": float(dp),
-                    "d_dp20": float(dp - closed_dp),
-                    "parted": _parted(run, closed_run),
-                    "approximate_outputs": run.departures,
-                    "disagreement": None if np.isnan(run.disagreement) else run.disagreement,
-                }
+            for i, (run, closed_run) in enumerate(zip(runs, closed_runs)):
+                auc, dp20 = (float(replay_scores[m][f, i, 0]) for m in ("auc", "dp20"))
+                closed_auc, closed_dp20 = (
+                    float(closed_scores[m][f, i, 0]) for m in ("auc", "dp20")
+                )
+                yield FidelityRow(
+                    closed_loop=path,
+                    forecaster=forecaster,
+                    replay=kind,
+                    sequence=run.recording.name,
+                    closed_auc=closed_auc,
+                    auc=auc,
+                    d_auc=auc - closed_auc,
+                    closed_dp20=closed_dp20,
+                    dp20=dp20,
+                    d_dp20=dp20 - closed_dp20,
+                    parted=_parted(run, closed_run),
+                    approximate_outputs=run.departures,
+                    disagreement=None if np.isnan(run.disagreement) else run.disagreement,
+                )
 
 
 def _check_same_tracker(closed: Trace, other: Trace) -> None:
@@ -106,23 +205,28 @@ def _check_same_tracker(closed: Trace, other: Trace) -> None:
 
 def _parted(replay: Run, closed: Run) -> int | None:
     """The first processed frame whose boxes in replay and closed loop overlap less than half."""
-    import numpy as np
-
-    from lae_sim.boxes import PARTED_IOU, iou
-
     apart = np.flatnonzero(iou(replay.boxes, closed.boxes) < PARTED_IOU)
     return int(closed.schedule.frames[apart[0]]) if len(apart) else None
 
 
-def summarised(rows: Sequence[Row]) -> Row:
-    """Means over the sequences that count."""
-    import numpy as np
-
-    found: Row = {"sequences": len(rows)}
-    for metric in ("auc", "dp20"):
-        for key in (f"closed_{metric}", metric):
-            found[key] = float(np.nanmean([row[key] for row in rows]))
-        apart = np.abs([row[f"d_{metric}"] for row in rows])
-        for name in ("mean", "median", "max"):
-            found[f"{name}_abs_d_{metric}"] = float(getattr(np, f"nan{name}")(apart))
-    return found
+def _summary(
+    closed_loop: str, forecaster: str, replay: str, rows: Sequence[FidelityRow]
+) -> FidelitySummary:
+    d_auc = np.abs([row.d_auc for row in rows])
+    d_dp20 = np.abs([row.d_dp20 for row in rows])
+    return FidelitySummary(
+        closed_loop=closed_loop,
+        forecaster=forecaster,
+        replay=replay,
+        sequences=len(rows),
+        closed_auc=float(np.nanmean([row.closed_auc for row in rows])),
+        auc=float(np.nanmean([row.auc for row in rows])),
+        mean_abs_d_auc=float(np.nanmean(d_auc)),
+        median_abs_d_auc=float(np.nanmedian(d_auc)),
+        max_abs_d_auc=float(np.nanmax(d_auc)),
+        closed_dp20=float(np.nanmean([row.closed_dp20 for row in rows])),
+        dp20=float(np.nanmean([row.dp20 for row in rows])),
+        mean_abs_d_dp20=float(np.nanmean(d_dp20)),
+        median_abs_d_dp20=float(np.nanmedian(d_dp20)),
+        max_abs_d_dp20=float(np.nanmax(d_dp20)),
+    )

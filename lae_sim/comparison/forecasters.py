@@ -12,12 +12,12 @@ import numpy as np
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.caveats import notes_on
 from lae_sim.evaluation.evaluate import Evaluation, evaluate
-from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention
+from lae_sim.evaluation.metrics import METRICS, find_convention
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.forecast.kalman import TunedKalman
 from lae_sim.learning.folds import Examples, Trainer, assign_folds, cross_fitted
-from lae_sim.replay.world import RECORDED, World
+from lae_sim.replay.world import RECORDED, World, label_of
 from lae_sim.trace.file import Trace
 
 if TYPE_CHECKING:
@@ -26,13 +26,10 @@ if TYPE_CHECKING:
 OFFLINE = "offline"
 
 
-def compare_forecasters(
+def score_forecasters(
     traces: Mapping[str, Trace],
     forecasters: Mapping[str, AnyFactory | Trainer],
-    world: World = RECORDED,
-    sigmas: Sequence[Fraction] = (Fraction(0),),
-    convention: Convention = PYSOT,
-    costs: Sequence[str] = (),
+    worlds: Sequence[World] = (RECORDED,),
     folds: int = 5,
     seed: int = 0,
     progress: Callable[[str], object] = lambda what: None,
@@ -46,11 +43,8 @@ def compare_forecasters(
     Args:
         traces: traces by name.
         forecasters: factories, or trainers, by name; ``"hold"`` is always compared.
-        world: how the traces are replayed.
-        sigmas: permitted latencies in frames, ascending.
-        convention: how frames and thresholds count.
-        costs: what forecasting costs, which delays the answers (see
-            :func:`lae_sim.forecast.costs.resolve_costs`).
+        worlds: how the traces are replayed, one after another; they share permitted latencies,
+            convention and costs. Their own forecasters do not count.
         folds: in how many parts the sequences are dealt out, if anything is trained.
         seed: of the folds and the training.
         progress: told what is done next.
@@ -62,26 +56,30 @@ def compare_forecasters(
         trained and which replays are approximations.
 
     Raises:
-        LaeError: if there is no trace, or whatever replaying, training and scoring raise.
+        LaeError: if there is no trace, the worlds differ in what they share, or whatever replaying,
+            training and scoring raise.
     """
     if not traces:
         raise LaeError("there is nothing to compare: name at least one trace")
     if OFFLINE in forecasters:
         raise LaeError(f"{OFFLINE} is the name of the tracker's own scores, not of a forecaster")
-    ready, notes = fitted(traces, {"hold": Hold, **forecasters}, world, folds, seed, progress)
+    if len({(world.sigmas, world.convention, world.costs) for world in worlds}) != 1:
+        raise LaeError("the worlds must share their permitted latencies, convention and costs")
+    sigmas, convention = worlds[0].sigmas, find_convention(worlds[0].convention)
+    ready, notes = fitted(traces, {"hold": Hold, **forecasters}, worlds, folds, seed, progress)
     tables = []
     for label, trace in traces.items():
         dataset = trace.metadata.dataset
-        for latency, scale, runs in world.replays(trace):
-            setting = latency if scale == 1 else f"{latency} x {scale}"
-            progress(f"{label}, {setting}")
-            priced = resolve_costs(costs, ready, [runs[0].recording])
-            found = evaluate(runs, trace.metadata, ready, sigmas, convention, costs=priced)
-            rows = _rows(found, list(ready), sigmas)
-            named = {"trace": label, "dataset": dataset, "latency": latency, "scale": float(scale)}
-            tables.append(rows.assign(**named))
-            notes += _notes(f"{label}, {setting}", found, priced)
-        about = notes_on(found, trace.metadata, convention, ready)
+        for world in worlds:
+            runs = list(world.replay(trace))
+            progress(f"{label}, {world.label()}")
+            costs = resolve_costs(world.costs, ready, [runs[0].recording])
+            evaluation = evaluate(runs, trace.metadata, ready, sigmas, convention, costs=costs)
+            rows = _rows(evaluation, list(ready), sigmas)
+            setting = {"latency": label_of(world.latency), "scale": float(world.scale)}
+            tables.append(rows.assign(trace=label, dataset=dataset, **setting))
+            notes += _notes(f"{label}, {world.label()}", evaluation, costs)
+        about = notes_on(evaluation, trace.metadata, convention, ready)
         notes += [f"{label}: {note}" for note in about]
     return _joined(tables, notes)
 
@@ -89,12 +87,12 @@ def compare_forecasters(
 def fitted(
     traces: Mapping[str, Trace],
     forecasters: Mapping[str, AnyFactory | Trainer],
-    world: World = RECORDED,
+    worlds: Sequence[World] = (RECORDED,),
     folds: int = 5,
     seed: int = 0,
     progress: Callable[[str], object] = lambda what: None,
 ) -> tuple[dict[str, AnyFactory], list[str]]:
-    """Train those forecasters that must be trained, across folds; see :func:`compare_forecasters`.
+    """Train those forecasters that must be trained, across folds; see :func:`score_forecasters`.
 
     Returns:
         A factory for each forecaster, and what to say of the training.
@@ -103,13 +101,12 @@ def fitted(
     trainers = {name: each for name, each in forecasters.items() if isinstance(each, Trainer)}
     if not trainers:
         return ready, []
-    examples = Examples.joined(
-        [Examples.of(runs) for trace in traces.values() for *_, runs in world.replays(trace)]
-    )
+    examples = Examples.of_traces(traces.values(), worlds)
     dealt = assign_folds(examples.sequences, folds, seed)
     for name, trainer in trainers.items():
-        told = partial(progress, f"training {name}")
-        ready[name] = cross_fitted(trainer, examples, dealt, seed, told)
+        ready[name] = cross_fitted(
+            trainer, examples, dealt, seed, partial(progress, f"training {name}")
+        )
     note = (
         f"{', '.join(trainers)}: trained in {max(dealt.values()) + 1} folds over {len(dealt)} "
         f"sequences (parts of a video together), seed {seed}: no sequence is scored by what was "
@@ -126,12 +123,12 @@ def fitted(
 def steps(
     traces: Mapping[str, Trace],
     forecasters: Mapping[str, AnyFactory | Trainer],
-    world: World,
+    worlds: Sequence[World],
     folds: int,
 ) -> int:
     """How often ``progress`` is called by it, if there are at least ``folds`` videos."""
     trained = sum(isinstance(each, Trainer) for each in forecasters.values())
-    return trained * folds + len(traces) * len(world.latencies) * len(world.scales)
+    return trained * folds + len(traces) * len(worlds)
 
 
 def _notes(where: str, found: Evaluation, costs: Mapping[str, int]) -> list[str]:

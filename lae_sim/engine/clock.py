@@ -9,11 +9,16 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from fractions import Fraction
+from operator import index
+from typing import TypeAlias
 
 from lae_sim.errors import LaeError
 
 NS_PER_SECOND = 10**9
 MAX_INT64 = 2**63 - 1
+
+Number: TypeAlias = int | float | str | Fraction
+"""A number where users give one: see :func:`exact`."""
 
 _DECIMAL = r"[0-9]{1,12}(?:\.[0-9]{1,12})?"
 _RATIONAL = re.compile(rf"(?:{_DECIMAL}|[0-9]{{1,12}}/[0-9]{{1,12}})\Z")
@@ -36,16 +41,41 @@ def parse_rational(text: str) -> Fraction:
     return Fraction(text)
 
 
-def parse_fps(text: str) -> Fraction:
+def exact(value: Number) -> Fraction:
+    """A number as it is written: text, or a plain number.
+
+    A float is what its shortest decimal form says: 1.5 is 3/2, 0.1 is 1/10.
+
+    Raises:
+        LaeError: if it is no exact number, such as ``"1/0"``, 1e-9 or ``True``.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float, str, Fraction)):
+        raise LaeError(f"{value!r:.40} is not an exact number, such as 2, 0.5 or '1/3'")
+    return Fraction(value) if isinstance(value, (int, Fraction)) else parse_rational(str(value))
+
+
+def parse_fps(value: Number) -> Fraction:
     """Read a frame rate in frames per second.
 
     Raises:
         LaeError: if it is not an exact number above zero.
     """
-    fps = parse_rational(text)
+    fps = exact(value)
     if fps <= 0:
-        raise LaeError(f"a frame rate must be above zero, not {text!r}")
+        raise LaeError(f"a frame rate must be above zero, not {value!r}")
     return fps
+
+
+def parse_stride(value: Number) -> Fraction:
+    """Read the stride of a pass (see :mod:`lae_sim.replay.strides`), such as ``2`` or ``3/2``.
+
+    Raises:
+        LaeError: if it is not an exact number above 1, or its numerator is above 1000.
+    """
+    stride = exact(value)
+    if not (stride > 1 and stride.numerator <= 1000):
+        raise LaeError(f"a stride is above 1, such as 2 or 3/2, not {value!r}")
+    return stride
 
 
 def parse_duration(text: str) -> int:
@@ -54,13 +84,29 @@ def parse_duration(text: str) -> int:
     Raises:
         LaeError: if the unit is missing, or the duration is not a whole number of nanoseconds.
     """
-    match = _DURATION.match(text)
+    match = _DURATION.match(text) if isinstance(text, str) else None
     if match is None:
-        raise LaeError(f"{text[:40]!r} is not a duration: write it with its unit, such as 47ms")
+        shown = repr(text[:40] if isinstance(text, str) else text)
+        raise LaeError(f"{shown} is not a duration: write it with its unit, such as 47ms")
     duration = Fraction(match[1]) * UNIT_NS[match[2]]
     if duration.denominator != 1:
         raise LaeError(f"{text!r} is not a whole number of nanoseconds")
     return int(duration)
+
+
+def duration_ns(duration: str | None, ns: int | None) -> int:
+    """A duration that is given as text with a unit, or as integer nanoseconds by name.
+
+    Raises:
+        LaeError: if it is given in no way or in both, or is below zero.
+        TypeError: if ``ns`` is not an integer, such as seconds as a float.
+    """
+    if (duration is None) == (ns is None):
+        raise LaeError("give a duration as text with its unit, such as '47ms', or as ns=47_000_000")
+    found = parse_duration(duration) if duration is not None else index(ns or 0)
+    if found < 0:
+        raise LaeError(f"a processing time cannot be negative ({found} ns)")
+    return found
 
 
 def whole(text: str, least: int = 0) -> int:

@@ -15,7 +15,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from lae_sim._arrays import Ints
-from lae_sim.engine.clock import Clock
+from lae_sim.engine.clock import Clock, duration_ns
 from lae_sim.engine.scheduler import Call, Policy
 
 
@@ -104,7 +104,7 @@ def every(n: int) -> LanePolicy:
     return _Every(n)
 
 
-def shrinking_tail(expected_ns: int) -> LanePolicy:
+def shrinking_tail(expected: str | None = None, *, ns: int | None = None) -> LanePolicy:
     """The newest frame, or the next one if waiting for it lowers the expected tail.
 
     Li, Wang and Ramanan, "Towards Streaming Perception" (2020), Alg. 1: with the tail
@@ -112,9 +112,13 @@ def shrinking_tail(expected_ns: int) -> LanePolicy:
     iff tau(s + r) < tau(s). A tracker that needs at most one frame interval never waits.
 
     Args:
-        expected_ns: the expected processing time r, ns.
+        expected: the expected processing time r with its unit, such as ``"47ms"``.
+        ns: the same in nanoseconds.
+
+    Raises:
+        LaeError: if it is not a duration.
     """
-    return _ShrinkingTail(expected_ns)
+    return _ShrinkingTail(duration_ns(expected, ns))
 
 
 def listed(frames: Sequence[int]) -> Policy:

@@ -22,9 +22,6 @@ from lae_sim.engine.clock import MAX_INT64
 from lae_sim.engine.scheduler import Schedule
 from lae_sim.errors import LaeError
 
-SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
-"""The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames."""
-
 MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
 _NEVER = 2**62
 _WIDE = 8  # from so many sigmas on, reduceat is slower than a loop over the sequences

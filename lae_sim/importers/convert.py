@@ -2,25 +2,190 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from lae_sim.engine.clock import Clock
+import numpy as np
+
+from lae_sim._arrays import Ints
+from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
+from lae_sim.engine.clock import Clock, parse_fps
 from lae_sim.errors import LaeError
+from lae_sim.importers.lae_pvt import read_run
+from lae_sim.importers.results import (
+    NO_TIMES,
+    GivenTimes,
+    Results,
+    Source,
+    find_results,
+    frame_ns,
+    given_times,
+    read_results,
+    tracker_name,
+)
+from lae_sim.trace.checks import RowChecker
+from lae_sim.trace.columns import Rows
+from lae_sim.trace.file import Trace
+from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.recording import Recording
 
-if TYPE_CHECKING:
-    from lae_sim._arrays import Ints
-    from lae_sim.datasets.annotations import GroundTruth
-    from lae_sim.importers.results import GivenTimes, Results, Source
-    from lae_sim.trace.recording import Recording
+Progress = Callable[[int, int], object]
+"""``progress(done, total)`` is called after each sequence."""
 
 
-def matched_results(
-    kind: str, sources: list[Source], truth: GroundTruth, arguments: argparse.Namespace
+@dataclass(frozen=True)
+class ConversionSummary:
+    """What results became.
+
+    Attributes:
+        format: of the results, a name of :data:`lae_sim.importers.results.FORMATS`.
+        schedule: ``"every-frame"`` or ``"real-time"``.
+        fps: world frame rate as exact text.
+        tracker, dataset: their names in the trace.
+        timing: where the times come from: ``source``, and a ``note`` if some were changed.
+        sequences, frames, processed: how many; a frame is processed where it has a time.
+        median_ms: median time of a processed frame, ms.
+        without_truth: results that were left out, since they have no ground truth.
+        without_results: sequences of the ground truth that have no results.
+        files: what was read.
+    """
+
+    format: str
+    schedule: str
+    fps: str
+    tracker: str
+    dataset: str
+    timing: Mapping[str, str]
+    sequences: int
+    frames: int
+    processed: int
+    median_ms: float
+    without_truth: list[str]
+    without_results: list[str]
+    files: list[Path]
+
+    def document(self, path: str | Path) -> dict[str, Any]:
+        """The summary as JSON values, of the trace written to ``path``."""
+        document = {"trace": str(path), **asdict(self)}
+        del document["files"]
+        return document
+
+
+def convert_results(
+    results: str | Path,
+    truth: str | Path,
+    *,
+    format: str = "auto",
+    fps: str | None = None,
+    time: str = "measured",
+    time_unit: str | None = None,
+    repetition: int = 1,
+    tracker: str | None = None,
+    device: str | None = None,
+    dataset: str | None = None,
+    sequences: Collection[str] = (),
+    exclude: Collection[str] = (),
+    truth_files: Mapping[str, str | Path] | None = None,
+    skip_missing: bool = False,
+    image_size: tuple[int, int] | None = None,
+    progress: Progress = lambda done, total: None,
+) -> tuple[Trace, ConversionSummary]:
+    """Make a trace from a tracker's results and the dataset's ground truth.
+
+    Args:
+        results: folder of one tracker's results, or a file.
+        truth: the dataset's folder (see :mod:`lae_sim.datasets.annotations`).
+        format: a name of :data:`lae_sim.importers.results.FORMATS`, or ``"auto"``.
+        fps: world frames per second as exact text; by default 30, or 10 if the dataset's name says
+            ``10fps``.
+        time: where times come from (see :func:`lae_sim.importers.results.given_times`).
+        time_unit: of measured times: ``"s"`` (the default), ``"ms"``, ``"us"`` or ``"ns"``.
+        repetition: which run to take where the toolkit repeats them, from 1.
+        tracker: its name; by default that of the results.
+        device: what the times were taken on.
+        dataset: its name; by default that of its folder.
+        sequences: names to keep; all by default.
+        exclude: names to leave out.
+        truth_files: other ground truth for some sequences, by name.
+        skip_missing: whether results without ground truth are left out instead of refused.
+        image_size: width and height of the images, pixels.
+        progress: called after each sequence.
+
+    Returns:
+        The trace, in memory, and its summary.
+
+    Raises:
+        LaeError: if the results or the ground truth are missing or damaged, or do not fit each
+            other.
+    """
+    if repetition < 1:
+        raise LaeError("--repetition counts from 1")
+    results = Path(results)
+    kind, sources = find_results(results, format, repetition)
+    other = {name: Path(path) for name, path in (truth_files or {}).items()}
+    annotations = find_truth(Path(truth)).with_files(other)
+    known, without_truth = _with_truth(kind, sources, annotations, skip_missing)
+    absent = sorted({*sequences, *exclude, *other} - set(known))
+    if absent:
+        raise LaeError(f"{results}: no results of sequence {listed(absent)}")
+    matched = {name: known[name] for name in sorted({*(sequences or known)} - {*exclude})}
+    if not matched:
+        raise LaeError("--exclude leaves no sequence")
+    dataset = dataset or annotations.dataset
+    fps = fps or ("10" if "10fps" in dataset.lower() else "30")
+    clock = Clock.at(parse_fps(fps))
+    tracker = tracker or tracker_name(kind, results, matched)
+    given = given_times(time, tracker)
+    schedule: dict[str, Any] = {"kind": "every-frame"}
+    if kind == "lae-pvt":
+        if given:
+            raise LaeError("--time does not go with lae-pvt, whose runs hold their own times")
+        schedule = {"kind": "real-time", "schedule": {"policy": "latest"}}
+        recordings, timing = _real_time(matched, annotations, clock, progress)
+    else:
+
+        def read(source: Source) -> Results:
+            return read_results(kind, source, repetition, time_unit, measured=given is None)
+
+        recordings, timing = _every_frame(matched, annotations, read, given, progress)
+    metadata = Metadata.new(
+        fps,
+        **schedule,
+        tracker={"name": tracker},
+        device={"model": device} if device else {},
+        dataset={"name": dataset},
+        timing=timing,
+        sequences=_sequence_entries(matched, read_attributes(annotations), image_size),
+    )
+    left_out = {*matched, *exclude}
+    elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
+    summary = ConversionSummary(
+        format=kind,
+        schedule=metadata.kind,
+        fps=fps,
+        tracker=tracker,
+        dataset=dataset,
+        timing=timing,
+        sequences=len(recordings),
+        frames=len(elapsed),
+        processed=int((elapsed >= 0).sum()),
+        median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
+        without_truth=without_truth,
+        without_results=[n for n in annotations.files if not sequences and n not in left_out],
+        files=[
+            *(file for source in matched.values() for file in (source.path, source.times) if file),
+            *annotations.files.values(),
+        ],
+    )
+    return Trace(metadata, recordings), summary
+
+
+def _with_truth(
+    kind: str, sources: Sequence[Source], truth: GroundTruth, skip_missing: bool
 ) -> tuple[dict[str, Source], list[str]]:
-    """The results of each sequence, sorted by name, and the names that have no ground truth."""
+    """The results of each sequence of the ground truth, and the names of those without one."""
     matched: dict[str, Source] = {}
     missing = []
     only_truth = next(iter(truth.files)) if truth.root.is_file() and len(sources) == 1 else None
@@ -35,39 +200,26 @@ def matched_results(
             )
         else:
             matched[name] = source
-    if not matched or (missing and not arguments.skip_missing):
+    if not matched or (missing and not skip_missing):
         raise LaeError(
-            f"{arguments.truth}: no ground truth for {listed(missing)}, of {len(sources)} results"
+            f"{truth.root}: no ground truth for {listed(missing)}, of {len(sources)} results"
             + ("; --skip-missing leaves them out" if matched else "; is it the right dataset?")
         )
-    named = {*arguments.sequence, *arguments.exclude, *dict(arguments.truth_file)}
-    absent = sorted(named - set(matched))
-    if absent:
-        raise LaeError(f"{arguments.results}: no results of sequence {listed(absent)}")
-    kept = set(arguments.sequence or matched) - set(arguments.exclude)
-    if not kept:
-        raise LaeError("--exclude leaves no sequence")
-    return {name: matched[name] for name in sorted(kept)}, missing
+    return matched, missing
 
 
-def every_frame(
-    kind: str,
+def _every_frame(
     matched: Mapping[str, Source],
     truth: GroundTruth,
+    read: Callable[[Source], Results],
     given: GivenTimes | None,
-    arguments: argparse.Namespace,
+    progress: Progress,
 ) -> tuple[list[Recording], dict[str, str]]:
-    """The recordings of results on every frame, and what to say of their times."""
-    from lae_sim.datasets.annotations import read_truth
-    from lae_sim.importers.results import read_results
-    from lae_sim.trace.recording import Recording
-
+    """The recordings of results on every frame, and what the trace says of their times."""
     recordings = []
     measured = True
-    for name, source in _progress(matched):
-        results = read_results(
-            kind, source, arguments.repetition, arguments.time_unit, measured=given is None
-        )
+    for name, source in matched.items():
+        results = read(source)
         boxes = read_truth(truth.files[name])
         elapsed = _elapsed(name, source, results, given)
         if len(results.boxes) != len(boxes):
@@ -77,9 +229,9 @@ def every_frame(
                 f"same frames with --truth-file {name}=FILE, or leave it out with --exclude {name}"
             )
         measured = measured and results.elapsed_ns is not None
-        recording = Recording.new(name, boxes, results.boxes, elapsed)
-        _check(recording, source.path, truth.files[name])
-        recordings.append(recording)
+        recordings.append(Recording.new(name, boxes, results.boxes, elapsed))
+        _check(recordings[-1], source.path, truth.files[name])
+        progress(len(recordings), len(matched))
     if given:
         return recordings, {"source": given.source}
     if measured:
@@ -91,10 +243,6 @@ def every_frame(
 
 def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | None) -> Ints:
     """Processing time of each frame, int64 [n], ns."""
-    import numpy as np
-
-    from lae_sim.importers.results import NO_TIMES, frame_ns
-
     count = len(results.boxes)
     if given:
         return np.full(count, given.of(name, count), np.int64)
@@ -110,18 +258,15 @@ def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | No
     raise LaeError(f"{source.path}: the results hold no times; {NO_TIMES}")
 
 
-def real_time(
-    matched: Mapping[str, Source], truth: GroundTruth, clock: Clock
+def _real_time(
+    matched: Mapping[str, Source], truth: GroundTruth, clock: Clock, progress: Progress
 ) -> tuple[list[Recording], dict[str, str]]:
-    """The recordings of released real-time runs, and what to say of their times."""
-    from lae_sim.datasets.annotations import read_truth
-    from lae_sim.importers.lae_pvt import read_run
-
+    """The recordings of released real-time runs, and what the trace says of their times."""
     runs = []
-    for name, source in _progress(matched):
-        run = read_run(source.path, name, read_truth(truth.files[name]), clock)
-        _check(run.recording, source.path, truth.files[name])
-        runs.append(run)
+    for name, source in matched.items():
+        runs.append(read_run(source.path, name, read_truth(truth.files[name]), clock))
+        _check(runs[-1].recording, source.path, truth.files[name])
+        progress(len(runs), len(matched))
     outputs = sum(int((run.recording.elapsed_ns >= 0).sum()) for run in runs)
     prolonged = [ns for run in runs for ns in run.prolonged_ns]
     unknown = sum(not run.init_known for run in runs)
@@ -141,13 +286,10 @@ def real_time(
 
 def _check(recording: Recording, results: Path, truth: Path) -> None:
     """Check one recording by the rules of the format, so that the message names its files."""
-    from lae_sim.trace.checks import RowChecker
-    from lae_sim.trace.columns import Rows
-
     RowChecker(f"{results} (ground truth {truth})")(Rows.of_recordings([recording]))
 
 
-def sequence_entries(
+def _sequence_entries(
     names: Iterable[str],
     attributes: Mapping[str, tuple[str, ...]],
     size: tuple[int, int] | None,
@@ -161,26 +303,6 @@ def sequence_entries(
         }
         entries[name] = {key: value for key, value in entry.items() if value}
     return entries
-
-
-def _progress(matched: Mapping[str, Source]) -> Iterator[tuple[str, Source]]:
-    from tqdm import tqdm
-
-    with tqdm(matched.items(), desc="convert", unit=" sequences", disable=None) as bar:
-        yield from bar
-
-
-def figures(recordings: Sequence[Recording]) -> dict[str, Any]:
-    """How much there is, and what a frame takes."""
-    import numpy as np
-
-    elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
-    return {
-        "sequences": len(recordings),
-        "frames": len(elapsed),
-        "processed": int((elapsed >= 0).sum()),
-        "median_ms": float(np.median(elapsed[elapsed >= 0])) / 1e6,
-    }
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

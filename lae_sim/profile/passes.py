@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,40 @@ Timing = Callable[[ImageSequence], Service]
 
 Progress = Callable[[int], object]
 """``progress(frames)`` is told how many more world frames are done."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A sequence that could not be profiled, and why."""
+
+    sequence: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class PassSummary:
+    """What a profiled trace holds, in short.
+
+    Attributes:
+        trace: its path.
+        schedule: as in its metadata.
+        timing: what the times are: ``"measured"``, or where they are from.
+        sequences, world_frames, processed: how many.
+        lost: processed frames where the tracker found nothing.
+        init_ms: mean time of an initialisation, ms.
+        median_ms, p95_ms: of the other calls, ms; None if there are none.
+    """
+
+    trace: str
+    schedule: Mapping[str, Any]
+    timing: str
+    sequences: int
+    world_frames: int
+    processed: int
+    lost: int
+    init_ms: float
+    median_ms: float | None
+    p95_ms: float | None
 
 
 @dataclass(frozen=True)
@@ -94,13 +128,13 @@ def base_document(
         warmup: calls before anything is measured.
         includes: what the times include.
     """
-    told = dict(tracker.describe())
-    measured = {key: told.pop(key) for key in ("synchronised", "threads") if key in told}
+    described = dict(tracker.describe())
+    measured = {k: described.pop(k) for k in ("synchronised", "threads") if k in described}
     return {
         "format": FORMAT,
         "version": VERSION,
         "fps": str(clock.fps),
-        "tracker": {"name": name, **told},
+        "tracker": {"name": name, **described},
         "device": {**describe_device(), "readings": {"before": readings()}},
         "timing": {
             "clock": "perf_counter_ns",
@@ -136,7 +170,7 @@ def run_pass(
     warmup: int,
     progress: Progress,
     buffered: bool = True,
-) -> list[dict[str, Any]]:
+) -> list[Failure]:
     """Run the sequences that the journal lacks, and put each into it.
 
     Args:
@@ -149,7 +183,7 @@ def run_pass(
         buffered: whether frames are decoded ahead of the measurement.
 
     Returns:
-        What failed: ``sequence`` and ``reason`` of each.
+        What failed.
 
     Raises:
         LaeError: if a finished sequence cannot be written.
@@ -175,7 +209,7 @@ def run_pass(
                 cold = False
             run = task.run(ready if buffered else sequence, progress=advance)
         except LaeError as error:
-            failures.append({"sequence": sequence.name, "reason": str(error)})
+            failures.append(Failure(sequence.name, str(error)))
             cold = cold or isinstance(error, TrackerError)
         else:
             during = []
@@ -188,15 +222,15 @@ def run_pass(
     return failures
 
 
-def write_pass(task: Pass, journal: Journal, failures: list[dict[str, Any]]) -> Metadata | None:
-    """Write the trace of a pass from its finished sequences; None if there are none.
+def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> bool:
+    """Write the trace of a pass from its finished sequences; whether there are any.
 
     Raises:
         LaeError: if it cannot be written.
     """
     kept = [metadata.document for metadata in journal.metadata(task.name)]
     if not kept:
-        return None
+        return False
     document = dict(task.metadata.document)
     document["sequences"] = {name: entry for d in kept for name, entry in d["sequences"].items()}
     during = [reading for d in kept for reading in d["device"]["readings"]["during"]]
@@ -208,34 +242,33 @@ def write_pass(task: Pass, journal: Journal, failures: list[dict[str, Any]]) -> 
     device["readings"] = {"before": before, "during": during, "after": readings()}
     document["device"] = device
     if failures:
-        document["failures"] = failures
+        document["failures"] = [asdict(failure) for failure in failures]
     entries = document["sequences"].values()
     measured = sum(entry["measured_ns"] for entry in entries)
     cpu = sum(entry["cpu_ns"] for entry in entries)
     document["timing"] = {**document["timing"], "cpu_share": round(cpu / max(measured, 1), 3)}
-    metadata = Metadata.of(document)
-    write_trace(Trace(metadata, journal.recordings(task.name)), task.path)
-    return metadata
+    write_trace(Trace(Metadata.of(document), journal.recordings(task.name)), task.path)
+    return True
 
 
-def summary(path: Path) -> dict[str, Any]:
-    """What a profiled trace holds, in short: counts, and times in ms."""
+def summary(path: Path) -> PassSummary:
+    """What a profiled trace holds, in short."""
     trace = read_trace(path)
+    document = trace.metadata.document
     recordings = list(trace)
     calls = np.concatenate([r.elapsed_ns[1:][r.elapsed_ns[1:] >= 0] for r in recordings])
-    entries = trace.metadata.document["sequences"].values()
-    return {
-        "trace": str(path),
-        "schedule": trace.metadata.document["schedule"],
-        "timing": trace.metadata.document["timing"]["source"],
-        "sequences": len(recordings),
-        "world_frames": sum(map(len, recordings)),
-        "processed": len(recordings) + len(calls),
-        "lost": sum(entry["lost"] for entry in entries),
-        "init_ms": float(np.mean([r.elapsed_ns[0] for r in recordings])) / 1e6,
-        "median_ms": float(np.median(calls)) / 1e6 if len(calls) else None,
-        "p95_ms": float(np.percentile(calls, 95)) / 1e6 if len(calls) else None,
-    }
+    return PassSummary(
+        trace=str(path),
+        schedule=document["schedule"],
+        timing=document["timing"]["source"],
+        sequences=len(recordings),
+        world_frames=sum(map(len, recordings)),
+        processed=len(recordings) + len(calls),
+        lost=sum(entry["lost"] for entry in document["sequences"].values()),
+        init_ms=float(np.mean([r.elapsed_ns[0] for r in recordings])) / 1e6,
+        median_ms=float(np.median(calls)) / 1e6 if len(calls) else None,
+        p95_ms=float(np.percentile(calls, 95)) / 1e6 if len(calls) else None,
+    )
 
 
 def warm_up(tracker: TimedTracker, sequence: ImageSequence, calls: int) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Ints
-from lae_sim.engine.clock import MAX_INT64
+from lae_sim.engine.clock import MAX_INT64, duration_ns
 from lae_sim.engine.scheduler import Service
 from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError
@@ -47,18 +47,20 @@ def by_call(recording: Recording) -> Times:
     return Times(recording.name, _recorded(recording), by_call=True)
 
 
-def constant(elapsed_ns: int) -> LatencySource:
-    """Every call takes ``elapsed_ns``, the initialisation too.
+def constant(elapsed: str | None = None, *, ns: int | None = None) -> LatencySource:
+    """Every call takes the same time, the initialisation too.
+
+    Args:
+        elapsed: the time with its unit, such as ``"47ms"``.
+        ns: the same in nanoseconds.
 
     Raises:
-        LaeError: if it is below zero.
+        LaeError: if it is not a duration, or below zero.
     """
-    if index(elapsed_ns) < 0:
-        raise LaeError(f"a processing time cannot be negative ({elapsed_ns} ns)")
-    ns = np.array(min(elapsed_ns, MAX_INT64), np.int64)
+    time = np.array(min(duration_ns(elapsed, ns), MAX_INT64), np.int64)
 
     def source(recording: Recording) -> Times:
-        return Times(recording.name, np.broadcast_to(ns, len(recording)), by_call=True)
+        return Times(recording.name, np.broadcast_to(time, len(recording)), by_call=True)
 
     return source
 

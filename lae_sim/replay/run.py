@@ -158,65 +158,70 @@ def _from_passes(
     return Run(recording, schedule, boxes, departures, float(parted.mean()))
 
 
-def replay_trace(
-    trace: Trace,
-    fps: Fraction | None = None,
-    source: LatencySource = by_frame,
-    policy: Policy = latest,
-    timing: Trace | None = None,
-    strided: Sequence[Trace] = (),
-    batch: bool = False,
-) -> Iterator[Run]:
-    """Replay every sequence of a trace, one after another.
+@dataclass(frozen=True, eq=False, repr=False)
+class Runs:
+    """The runs of a trace, one per sequence, made anew each time one goes through them.
 
-    Args:
+    Attributes:
         trace: the boxes and the truth.
-        fps: world frame rate; the trace's own by default.
+        clock: the world's.
         source: how to take processing times from a recording.
         policy: which frame is processed next.
         timing: another device's trace to take the times from; it must have the same sequences.
-        strided: traces of the same tracker at other strides (see :func:`replay_sequence`).
+        passes: traces of the same tracker at other strides (see :func:`replay_sequence`).
         batch: schedule many sequences at once where source and policy allow it (see
             :func:`lae_sim.engine.lanes.batchable`). The runs are the same, and come in groups.
 
     Raises:
-        LaeError: if a sequence or frame that is asked for is not there.
+        LaeError: if two passes have the same stride; while one goes through the runs, if a
+            sequence or frame that is asked for is not there.
     """
-    clock = Clock.at(trace.metadata.fps if fps is None else fps)
-    for jobs in batched(_jobs(trace, timing, strided), _GROUP_FRAMES if batch else 1):
-        yield from _replayed(jobs, clock, [source(job.times) for job in jobs], policy)
+
+    trace: Trace
+    clock: Clock
+    source: LatencySource = by_frame
+    policy: Policy = latest
+    timing: Trace | None = None
+    passes: tuple[Trace, ...] = ()
+    batch: bool = False
+
+    def __post_init__(self) -> None:
+        strides = [trace.metadata.stride for trace in (self.trace, *self.passes)]
+        if self.passes and len(set(strides)) != len(strides):
+            raise LaeError("two of the passes have the same stride: give each stride once")
+
+    def __iter__(self) -> Iterator[Run]:
+        frames = _GROUP_FRAMES if self.batch else 1
+        for jobs in batched(_jobs(self.trace, self.timing, self.passes), frames):
+            services = [self.source(job.times) for job in jobs]
+            yield from _replayed(jobs, self.clock, services, self.policy)
+
+    def __repr__(self) -> str:
+        return f"<Runs of {self.trace!r} at {self.clock.fps} fps>"
 
 
-def replay_repeated(
-    trace: Trace,
-    source: RandomSource,
-    count: int,
-    fps: Fraction | None = None,
-    policy: Policy = latest,
-    timing: Trace | None = None,
-    first: int = 0,
-) -> Iterator[tuple[int, Run]]:
+def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[int, Run]]:
     """Replay a trace again and again, under other random times in each repetition.
 
     Args:
-        trace: the boxes and the truth.
-        source: draws the times; its own repetition does not count.
+        runs: of a trace with random times, without passes; the repetition of their source does not
+            count.
         count: number of repetitions.
-        fps: world frame rate; the trace's own by default.
-        policy: which frame is processed next.
-        timing: another device's trace to take the times from.
         first: the first repetition.
 
     Yields:
-        The repetition and the run, which is that of :func:`replay_trace` with the source in that
-        repetition. Sequences come in groups; in a group, repetition after repetition, and in a
-        repetition sequence after sequence.
+        The repetition and the run, which is that of ``runs`` with the source in that repetition.
+        Sequences come in groups; in a group, repetition after repetition, and in a repetition
+        sequence after sequence.
 
     Raises:
-        LaeError: if a sequence or frame that is asked for is not there.
+        LaeError: if the times are not random, or a sequence or frame that is asked for is not
+            there.
     """
-    clock = Clock.at(trace.metadata.fps if fps is None else fps)
-    for jobs in batched(_jobs(trace, timing), _GROUP_FRAMES):
+    source = runs.source
+    if not isinstance(source, RandomSource) or runs.passes:
+        raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
+    for jobs in batched(_jobs(runs.trace, runs.timing), _GROUP_FRAMES):
         size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
         for begin in range(first, first + count, size):
             some = range(begin, min(begin + size, first + count))
@@ -226,8 +231,8 @@ def replay_repeated(
                 for k in range(len(some))
                 for job, rows in zip(jobs, drawn)
             ]
-            runs = _replayed(jobs * len(some), clock, times, policy)
-            yield from ((r, next(runs)) for r in some for _ in jobs)
+            replayed = _replayed(jobs * len(some), runs.clock, times, runs.policy)
+            yield from ((r, next(replayed)) for r in some for _ in jobs)
 
 
 def _replayed(
@@ -245,8 +250,6 @@ def _jobs(trace: Trace, timing: Trace | None, strided: Sequence[Trace] = ()) -> 
         for other in strided
     }
     stride = trace.metadata.stride
-    if stride in passes or len(passes) != len(strided):
-        raise LaeError("two of the passes have the same stride: give each stride once")
     for recording in trace:
         yield _Job(
             recording,

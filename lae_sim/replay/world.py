@@ -1,50 +1,231 @@
-"""How traces are replayed and scored."""
+"""World: under what traces are replayed and scored, as names and plain values.
+
+Command lines, study files and keyword arguments all make worlds, through the parsers here.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from itertools import product
+from typing import Any, TypeAlias, TypeVar
 
-from lae_sim.engine.clock import parse_duration, whole
-from lae_sim.engine.policies import latest
-from lae_sim.engine.scheduler import Policy
+from lae_sim.engine import policies
+from lae_sim.engine.clock import Clock, Number, exact, parse_fps, whole
+from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError
-from lae_sim.replay.latency import LatencySource, by_frame, scaled
-from lae_sim.replay.run import Run, replay_trace
-from lae_sim.trace.file import Trace
+from lae_sim.plugins import bound, imported
+from lae_sim.replay import latency as sources
+from lae_sim.replay.latency import LatencySource, scaled
+from lae_sim.replay.run import Runs
+from lae_sim.trace.file import Trace, read_trace
 
-if TYPE_CHECKING:
-    from lae_sim.engine.scheduler import Policy
-    from lae_sim.replay.latency import LatencySource
+SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
+"""The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames."""
+
+TraceLike: TypeAlias = "str | os.PathLike[str] | Trace"
+"""An open trace, or the path or URL of one."""
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
 class World:
-    """How traces are replayed.
+    """Under what traces are replayed and scored.
 
     Attributes:
-        latencies: latency sources by name.
-        scales: exact factors on all times.
-        fps: world frame rate; each trace's own if None.
-        policy: which frame is processed next.
+        fps: frames that the world shows per second; each trace's own if None.
+        policy: which frame a free tracker takes: a name (see :func:`parse_policy`), or a policy.
+        latency: where processing times come from: a name (see :func:`parse_latency`), or a source.
+        scale: exact factor on all times.
+        timing: another device's trace of the same sequences, to take the times from.
+        passes: traces of the same tracker at other strides, one of which each sequence's boxes
+            come from (see :func:`lae_sim.replay.run.replay_sequence`).
+        sigmas: permitted latencies in frames, ascending.
+        convention: how frames and thresholds count, by name.
+        forecasters: names.
+        costs: what forecasting costs, such as ``"2ms"`` or ``"kalman=2ms"``.
+
+    Raises:
+        LaeError: if a value is impossible, or some do not go together.
     """
 
-    latencies: Mapping[str, LatencySource]
-    scales: Sequence[Fraction] = (Fraction(1),)
     fps: Fraction | None = None
-    policy: Policy = latest
+    policy: str | Policy = "latest"
+    latency: str | LatencySource = "recorded"
+    scale: Fraction = Fraction(1)
+    timing: TraceLike | None = None
+    passes: tuple[TraceLike, ...] = ()
+    sigmas: tuple[Fraction, ...] = (Fraction(0),)
+    convention: str = "pysot"
+    forecasters: tuple[str, ...] = ("hold",)
+    costs: tuple[str, ...] = ()
 
-    def replays(self, trace: Trace) -> Iterator[tuple[str, Fraction, list[Run]]]:
-        """The latency's name, the scale and the runs of each way to replay a trace."""
-        for name, source in self.latencies.items():
-            for scale in self.scales:
-                runs = replay_trace(trace, self.fps, scaled(source, scale), self.policy)
-                yield name, scale, list(runs)
+    def __post_init__(self) -> None:
+        for name in ("passes", "sigmas", "forecasters", "costs"):
+            if not isinstance(getattr(self, name), tuple):
+                raise LaeError(f"{name} of a World is a tuple; World.of takes one value too")
+        if self.fps is not None:
+            Clock.at(self.fps)
+            if self.fps <= 0:
+                raise LaeError(f"fps: a frame rate must be above zero, not {self.fps}")
+        if not all(isinstance(each, (Fraction, int)) for each in (self.scale, *self.sigmas)):
+            raise LaeError("scale and sigmas of a World are exact; World.of takes text too")
+        scaled(self.source(), self.scale)
+        check_sigmas(self.sigmas)
+        if not scores_latency(self.rule()):
+            for given, what in ((any(self.sigmas), "permitted latency"), (self.costs, "cost")):
+                if given:
+                    name = self.policy if isinstance(self.policy, str) else "the policy"
+                    raise LaeError(f"{name} never scores latency: it goes with no {what}")
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        fps: Number | None = None,
+        policy: str | Policy = "latest",
+        latency: str | LatencySource = "recorded",
+        scale: Number = 1,
+        timing: TraceLike | None = None,
+        passes: TraceLike | Iterable[TraceLike] = (),
+        sigma: Number | Iterable[Number] = 0,
+        convention: str = "pysot",
+        forecasters: str | Iterable[str] = ("hold",),
+        costs: str | Iterable[str] = (),
+    ) -> World:
+        """A world from text and plain numbers, as command lines and files have them.
+
+        One value will do where several are possible; ``sigma`` may be ``"grid"``. A float counts as
+        it is written: 1.5 is 3/2, 0.1 is 1/10.
+
+        Raises:
+            LaeError: if a value is impossible; it names the argument.
+        """
+        return cls(
+            fps=None if fps is None else named("fps", parse_fps, fps),
+            policy=policy,
+            latency=latency,
+            scale=named("scale", exact, scale),
+            timing=timing,
+            passes=several(passes),
+            sigmas=named("sigma", parse_sigmas, sigma),
+            convention=convention,
+            forecasters=tuple(dict.fromkeys(several(forecasters))),
+            costs=several(costs),
+        )
+
+    @classmethod
+    def sweep(
+        cls,
+        *,
+        policy: Any = "latest",
+        fps: Any = None,
+        latency: Any = "recorded",
+        scale: Any = 1,
+        **others: Any,
+    ) -> tuple[World, ...]:
+        """The worlds of every combination of some policies, rates, latencies and scales.
+
+        Each is one value or several; the last varies fastest. ``others`` are as in :meth:`of`.
+        """
+        lists = (several(policy), several(fps) or (None,), several(latency), several(scale))
+        worlds = (
+            cls.of(policy=rule, fps=rate, latency=source, scale=factor, **others)
+            for rule, rate, source, factor in product(*lists)
+        )
+        return tuple(dict.fromkeys(worlds))
+
+    def rule(self) -> Policy:
+        """The policy itself."""
+        return parse_policy(self.policy) if isinstance(self.policy, str) else self.policy
+
+    def source(self) -> LatencySource:
+        """The source of the processing times, before they are scaled."""
+        return parse_latency(self.latency) if isinstance(self.latency, str) else self.latency
+
+    def label(self) -> str:
+        """The latency and its scale, such as ``"recorded x 2"``."""
+        name = label_of(self.latency)
+        return name if self.scale == 1 else f"{name} x {self.scale}"
+
+    def replay(
+        self, trace: TraceLike, sequences: Iterable[str] | None = None, batch: bool = False
+    ) -> Runs:
+        """Replay a trace in this world.
+
+        Args:
+            trace: the boxes and the truth.
+            sequences: those to read, where traces are given by their paths; all by default.
+            batch: schedule many sequences at once where policy and latency allow it (see
+                :func:`lae_sim.engine.lanes.batchable`). The runs are the same.
+
+        Raises:
+            LaeError: if a trace is missing or damaged, or the passes do not go together.
+        """
+        names = None if sequences is None else frozenset(sequences)
+        opened = open_trace(trace, names)
+        return Runs(
+            opened,
+            Clock.at(opened.metadata.fps if self.fps is None else self.fps),
+            scaled(self.source(), self.scale),
+            self.rule(),
+            None if self.timing is None else open_trace(self.timing),
+            tuple(open_trace(each, names) for each in self.passes),
+            batch,
+        )
 
 
-RECORDED = World({"recorded": by_frame})
+def replay_trace(
+    trace: TraceLike,
+    *,
+    fps: Number | None = None,
+    policy: str | Policy = "latest",
+    latency: str | LatencySource = "recorded",
+    scale: Number = 1,
+    timing: TraceLike | None = None,
+    passes: TraceLike | Iterable[TraceLike] = (),
+    batch: bool = False,
+) -> Runs:
+    """Replay every sequence of a trace, one after another.
+
+    Args:
+        trace: the boxes and the truth: an open trace, or the path or URL of one.
+        fps, policy, latency, scale, timing, passes: see :meth:`World.of`.
+        batch: see :meth:`World.replay`.
+
+    Returns:
+        The runs, which are made while one goes through them, and may be gone through again.
+
+    Raises:
+        LaeError: if an argument is impossible or a file missing; while the runs are made, if a
+            sequence or frame that is asked for is not there.
+
+    Example:
+        >>> import lae_sim
+        >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
+        >>> [len(run) for run in runs][:3]
+        [400, 400, 400]
+    """
+    world = World.of(
+        fps=fps, policy=policy, latency=latency, scale=scale, timing=timing, passes=passes
+    )
+    return world.replay(trace, batch=batch)
+
+
+def open_trace(trace: TraceLike, sequences: Iterable[str] | None = None) -> Trace:
+    """The trace, opened if it is not yet.
+
+    Raises:
+        LaeError: if it is neither a trace nor a path, or cannot be opened.
+    """
+    if isinstance(trace, Trace):
+        return trace
+    if not isinstance(trace, (str, os.PathLike)):
+        raise LaeError(f"a trace is a path, a URL or what read_trace gives, not {trace!r:.60}")
+    return read_trace(trace, None if sequences is None else frozenset(sequences))
 
 
 def parse_policy(text: str) -> Policy:
@@ -55,8 +236,6 @@ def parse_policy(text: str) -> Policy:
     Raises:
         LaeError: if there is none of that name, or its value does not fit.
     """
-    from lae_sim.engine import policies
-
     name, colon, value = text.partition(":")
     if text == "latest":
         return policies.latest
@@ -65,11 +244,11 @@ def parse_policy(text: str) -> Policy:
     if name == "every":
         return policies.every(_number(text, value, least=1))
     if name == "shrinking-tail" and value:
-        return policies.shrinking_tail(parse_duration(value))
+        return policies.shrinking_tail(value)
     if name == "vot-realtime":
         return policies.vot_realtime(*([_number(text, value)] if value else []))
     if colon and name not in ("latest", "fifo", "shrinking-tail"):
-        policy: Policy = _own("policy", text)
+        policy: Policy = _plugin("policy", text)
         return policy
     raise LaeError(
         f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
@@ -85,24 +264,22 @@ def parse_latency(text: str) -> LatencySource:
     Raises:
         LaeError: if there is none of that name, or its value does not fit.
     """
-    from lae_sim.replay import latency
-
     name, colon, value = text.partition(":")
     if text == "recorded":
-        return latency.by_frame
+        return sources.by_frame
     if text == "by-call":
-        return latency.by_call
+        return sources.by_call
     if name == "constant":
-        return latency.constant(parse_duration(value))
+        return sources.constant(value)
     if name == "resample":
-        return latency.resampled(_number(text, value))
+        return sources.resampled(_number(text, value))
     if name == "lognormal":
-        return latency.lognormal(_number(text, value))
+        return sources.lognormal(_number(text, value))
     if name == "bootstrap":
         seed, *block = value.split(":", 1)
-        return latency.bootstrap(_number(text, seed), *(_number(text, n, least=1) for n in block))
+        return sources.bootstrap(_number(text, seed), *(_number(text, n, least=1) for n in block))
     if colon and name not in ("recorded", "by-call"):
-        source: LatencySource = _own("latency", text)
+        source: LatencySource = _plugin("latency", text)
         return source
     raise LaeError(
         f"no latency {text!r}: there are recorded, by-call, constant:47ms, resample:SEED, "
@@ -110,12 +287,58 @@ def parse_latency(text: str) -> LatencySource:
     )
 
 
-def _own(what: str, text: str) -> Any:
-    """What a user made, or an instance of it if it is a class."""
-    from lae_sim.plugins import bound, imported
+def parse_sigmas(value: Number | Iterable[Number]) -> tuple[Fraction, ...]:
+    """Permitted latencies in ascending order: one, several, or ``"grid"``.
 
-    found = imported(f"{what} {text!r}", text)
-    return bound(f"{what} {text!r}", found, [], {}) if isinstance(found, type) else found
+    Raises:
+        LaeError: if one is not an exact number.
+    """
+    if isinstance(value, str) and value == "grid":
+        return SIGMA_GRID
+    return tuple(sorted({exact(each) for each in several(value)}))
+
+
+def check_sigmas(sigmas: tuple[Fraction, ...]) -> None:
+    """Check permitted latencies.
+
+    Raises:
+        LaeError: if they are not ascending, each of them once.
+    """
+    if list(sigmas) != sorted(set(sigmas)) or not sigmas:
+        raise LaeError("sigma: permitted latencies must be ascending, each of them once")
+
+
+def several(value: Any) -> tuple[Any, ...]:
+    """One value, or several, as a tuple; None is none. Text, a trace, a function are one value."""
+    if value is None:
+        return ()
+    one = isinstance(value, (str, os.PathLike, Trace)) or not isinstance(value, Iterable)
+    return (value,) if one else tuple(value)
+
+
+def named(name: str, parse: Callable[[Any], Value], value: Any) -> Value:
+    """What a parser makes of an argument's value.
+
+    Raises:
+        LaeError: what the parser raises, with the argument's name.
+    """
+    try:
+        return parse(value)
+    except LaeError as error:
+        raise LaeError(f"{name}: {error}") from error
+
+
+def label_of(plugin: object) -> str:
+    """The name of a policy or a source of times in tables."""
+    if isinstance(plugin, str):
+        return plugin
+    return str(getattr(plugin, "__name__", type(plugin).__name__))
+
+
+def _plugin(what: str, text: str) -> Any:
+    """What a user made, or an instance of it if it is a class."""
+    made = imported(f"{what} {text!r}", text)
+    return bound(f"{what} {text!r}", made, [], {}) if isinstance(made, type) else made
 
 
 def _number(text: str, value: str, least: int = 0) -> int:
@@ -123,3 +346,7 @@ def _number(text: str, value: str, least: int = 0) -> int:
         return whole(value, least)
     except LaeError as error:
         raise LaeError(f"{text!r} needs a whole number from {least} after the colon") from error
+
+
+RECORDED = World()
+"""Every trace as it was recorded, without a permitted latency."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from lae_sim.comparison.fidelity import FidelityRow, FidelitySummary
 from lae_sim.comparison.statistics import KEYS
 from lae_sim.report.table import (
     METRIC_LABELS,
@@ -101,13 +102,12 @@ _FIDELITY = {
 }
 
 
-def fidelity_table(rows: Sequence[Row]) -> str:
+def fidelity_table(rows: Sequence[FidelityRow] | Sequence[FidelitySummary]) -> str:
     """How far replays are from closed loops: a line per closed loop, forecaster and replay.
 
-    ``rows`` are what :func:`lae_sim.comparison.fidelity.summarised` gave, with their groups, or
-    :func:`~lae_sim.comparison.fidelity.compared`, which gives a row per sequence.
+    Of rows per sequence, a line each.
     """
-    each = "sequence" in rows[0]
+    each = isinstance(rows[0], FidelityRow)
     labels = [*_REPLAYED, "sequence"] if each else _REPLAYED
     columns = [Column(key.replace("_", " "), key, is_label=True) for key in labels]
     if not each:
@@ -115,7 +115,7 @@ def fidelity_table(rows: Sequence[Row]) -> str:
     columns += [
         Column(title, key, SIGNED if key.startswith("d_") else SCORE)
         for key, title in _FIDELITY.items()
-        if key in rows[0]
+        if hasattr(rows[0], key)
     ]
     if each:
         columns += [Column("parted at", "parted"), Column("disagree", "disagreement", SCORE)]

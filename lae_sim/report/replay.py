@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.comparison.statistics import recovered
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.pairing import SIGMA_GRID
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.table import (
     CHANGE,
     PERCENT,
@@ -122,21 +123,21 @@ def _scores(
     means: Report = {m: _mean(evaluation.scores[m][f, which, s]) for m in METRICS}
     hold = forecasters.index("hold")
     for metric in ("auc", "dp20"):
-        recovered = None
+        share = None
         if f != hold and not evaluation.missing[which].any():
             scores = evaluation.scores[metric]
-            recovered = _recovered(
+            share = _recovered(
                 evaluation.offline[metric][which], scores[hold, which, s], scores[f, which, s]
             )
-        means[f"recovered_{metric}"] = recovered
+        means[f"recovered_{metric}"] = share
     return means
 
 
 def _recovered(offline: Floats, hold: Floats, forecast: Floats) -> float | None:
     """Share of the latency loss recovered, over sequences that count in all; none if no loss."""
     counted = ~np.isnan(offline + hold + forecast)
-    loss = float((offline - hold)[counted].sum())
-    return float((forecast - hold)[counted].sum()) / loss if loss > 0 else None
+    won, lost = (float((scores - hold)[counted].sum()) for scores in (forecast, offline))
+    return recovered(won, lost)
 
 
 def _offline(evaluation: Evaluation, metric: str, which: slice | list[int]) -> float | None:

@@ -124,14 +124,14 @@ class View:
                 yield {**row, "sequence": scores.sequences[s], "value": float(aucs[s])}
 
 
-def row_of(scores: Scores) -> Row:
+def row_of(scores: Scores) -> dict[str, Any]:
     """What says which scores these are, as the rows of the summary say it."""
     return {
         **scores.setting.columns(),
         "dataset": scores.source.metadata.dataset,
         "convention": scores.convention,
         "forecaster": scores.forecaster,
-        "sigma": str(scores.setting.sigmas[0]),
+        "sigma": str(scores.setting.world.sigmas[0]),
     }
 
 

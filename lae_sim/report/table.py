@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import re
 import textwrap
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -94,9 +94,9 @@ class Column:
 
     Attributes:
         title: its heading.
-        value: the key of a value in the record, with an interval if the record has that
-            (``KEY_low`` and ``KEY_high``); or a function of the record, which gives a value or a
-            whole `Cell`.
+        value: the name of a value of the record (or mapping), which has an interval if there are
+            ``NAME_low`` and ``NAME_high`` beside it; or a function of the record, which gives a
+            value or a whole `Cell`.
         form: makes text of a value, and of a value and its interval.
         meaning: what the column holds, where the heading does not say it.
         is_label: whether it names the rows; such columns come first, and are left-aligned.
@@ -114,15 +114,20 @@ class Column:
 
     def cell(self, record: Any) -> Cell:
         """What the column shows of a record."""
-        value = record.get(self.value) if isinstance(self.value, str) else self.value(record)
+        value = _get(record, self.value) if isinstance(self.value, str) else self.value(record)
         if isinstance(value, Cell):
             return value
         if is_unknown(value):
             return UNKNOWN
-        if isinstance(self.value, str) and not is_unknown(record.get(f"{self.value}_low")):
-            interval = record[f"{self.value}_low"], record[f"{self.value}_high"]
-            return Cell(self.form(value, interval), value, interval)
-        return Cell(self.form(value), value)
+        low, high = _get(record, f"{self.value}_low"), _get(record, f"{self.value}_high")
+        if is_unknown(low):
+            return Cell(self.form(value), value)
+        return Cell(self.form(value, (low, high)), value, (low, high))
+
+
+def _get(record: Any, name: str) -> Any:
+    """A value of a record or a mapping; None if there is none."""
+    return record.get(name) if isinstance(record, Mapping) else getattr(record, name, None)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from lae_sim.report.table import COUNT, Column, Number, Table, text_of
 from lae_sim.trace.describe import Report, gathered
 
 if TYPE_CHECKING:
+    from lae_sim.profile.passes import PassSummary
     from lae_sim.trace.describe import SequenceTimes
 
 _WIDTH, _INDENT, _BAR, _STALLS = 96, 13, 50, 10
@@ -186,7 +187,7 @@ def _stalls(stalls: list[dict[str, Any]]) -> list[str]:
     return [*lines, ""]
 
 
-def profile_table(reports: Sequence[Mapping[str, Any]]) -> str:
+def profile_table(passes: Sequence[PassSummary]) -> str:
     """What a profile's passes left: a line per trace."""
     ms = Number(".2f")
     columns = [
@@ -199,7 +200,7 @@ def profile_table(reports: Sequence[Mapping[str, Any]]) -> str:
         Column("median ms", "median_ms", ms),
         Column("p95 ms", "p95_ms", ms),
     ]
-    return text_of(Table.of(columns, reports))
+    return text_of(Table.of(columns, passes))
 
 
 @styled

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from fractions import Fraction
 from functools import cached_property
@@ -24,15 +24,15 @@ from lae_sim.evaluation.evaluate import Evaluation, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes
-from lae_sim.replay.latency import LatencySource, RandomSource, bootstrap, scaled
-from lae_sim.replay.run import Run, replay_repeated, replay_trace
-from lae_sim.replay.world import parse_latency, parse_policy
+from lae_sim.replay.latency import RandomSource
+from lae_sim.replay.run import Run, replay_repeated
+from lae_sim.replay.world import World, label_of
 from lae_sim.study.rows import CellRows
 from lae_sim.study.spec import RANDOM
 from lae_sim.trace.file import Trace, held, read_trace
 from lae_sim.trace.metadata import Metadata
 
-VERSION = 1
+VERSION = 2
 """Of the cells' files; another version is another cell."""
 
 GROUP = 1 << 17
@@ -58,39 +58,48 @@ class Input:
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to replay one trace.
+    """One way to replay and score one trace.
 
     Attributes:
         trace: the boxes and the truth.
-        timing: another device's trace that the times come from.
+        timing: another device's trace that the times come from; the world names it too.
+        world: how the trace is replayed and scored; of random times with their seed.
         code: of a user's own policy or latency, a digest of its file.
-        policy, latency: names.
-        fps: world frame rate.
-        scale: exact factor on all times.
         first, count: which repetitions of a random latency; 0 and 1 of any other.
-        seed, block: of a random latency.
-        sigmas: permitted latencies, frames, ascending.
         sequences: those wanted; all if empty.
     """
 
     trace: Input
     timing: Input | None
+    world: World
     code: str
-    policy: str
-    fps: Fraction
-    latency: str
-    scale: Fraction
     first: int
     count: int
-    seed: int
-    block: int
-    sigmas: tuple[Fraction, ...]
     sequences: tuple[str, ...]
 
     @property
     def run(self) -> str:
         """The trace's label, and that of the one whose times it takes, if it is another."""
         return self.trace.label + ("" if self.timing is None else f" at {self.timing.label}")
+
+    @property
+    def fps(self) -> Fraction:
+        """World frame rate, which a study always knows."""
+        if self.world.fps is None:
+            raise ValueError("the world of a setting has a frame rate of its own")
+        return self.world.fps
+
+    @property
+    def policy(self) -> str:
+        """The policy as the study names it."""
+        return label_of(self.world.policy)
+
+    @property
+    def latency(self) -> str:
+        """The latency as the study names it, without the seed of a random one."""
+        latency = label_of(self.world.latency)
+        kind = latency.partition(":")[0]
+        return kind if kind in RANDOM else latency
 
     def columns(self) -> dict[str, str]:
         """What names the replay in tables."""
@@ -100,24 +109,21 @@ class Setting:
             "policy": self.policy,
             "fps": str(self.fps),
             "latency": self.latency,
-            "scale": str(self.scale),
+            "scale": str(self.world.scale),
         }
 
     def document(self) -> dict[str, Any]:
         """Plain values of all that the rows depend on: labels and contents of files, not paths."""
         return {
+            **self.columns(),
             "trace": [self.trace.label, self.trace.digest],
             "timing": self.timing and [self.timing.label, self.timing.digest],
             "code": self.code,
-            "policy": self.policy,
-            "fps": str(self.fps),
-            "latency": self.latency,
-            "scale": str(self.scale),
+            "latency": label_of(self.world.latency),
             "first": self.first,
             "count": self.count,
-            "seed": self.seed,
-            "block": self.block,
-            "sigmas": [str(sigma) for sigma in self.sigmas],
+            "sigmas": [str(sigma) for sigma in self.world.sigmas],
+            "convention": self.world.convention,
             "sequences": list(self.sequences),
         }
 
@@ -131,14 +137,12 @@ class Cell:
         forecaster: its name.
         code: what else it depends on: a digest of its file or of its training.
         cost_ns: what an answer costs.
-        convention: how frames and thresholds count.
     """
 
     setting: Setting
     forecaster: str
     code: str
     cost_ns: int
-    convention: str
 
     @cached_property
     def key(self) -> str:
@@ -150,7 +154,6 @@ class Cell:
             "forecaster": self.forecaster,
             "code": self.code,
             "cost_ns": self.cost_ns,
-            "convention": self.convention,
         }
         return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:32]
 
@@ -160,7 +163,7 @@ class Cell:
             **self.setting.columns(),
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
-            "convention": self.convention,
+            "convention": self.setting.world.convention,
             "forecaster": self.forecaster,
         }
 
@@ -194,28 +197,18 @@ class Result:
 
 
 def compute(task: Task) -> list[Result]:
-    """Replay once for each convention, and score.
+    """Replay, and score with every forecaster.
 
     Raises:
         LaeError: whatever replaying and scoring raise.
     """
-    conventions = dict.fromkeys(cell.convention for cell in task.cells)
-    return [
-        result
-        for convention in conventions
-        for result in _computed(
-            [cell for cell in task.cells if cell.convention == convention], task.factories
-        )
-    ]
-
-
-def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> list[Result]:
-    """The results of cells of one setting and one convention."""
-    setting, convention = cells[0].setting, find_convention(cells[0].convention)
+    cells, factories = task.cells, task.factories
+    setting = cells[0].setting
+    world, convention = setting.world, find_convention(setting.world.convention)
     trace = held(read_trace(setting.trace.path, setting.sequences or None))
     chosen = {cell.forecaster: factories[cell.forecaster] for cell in cells}
     costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
-    writers = [CellRows(setting.sigmas, cell.about(trace.metadata)) for cell in cells]
+    writers = [CellRows(world.sigmas, cell.about(trace.metadata)) for cell in cells]
     replay = replayed(setting, trace)
     repetitions: list[int] = []
 
@@ -227,7 +220,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
     curves, kept = _Curves(), []
     departures = calls = 0
     for part in evaluate_groups(
-        runs(), trace.metadata, chosen, setting.sigmas, convention, costs=costs, frames=GROUP
+        runs(), trace.metadata, chosen, world.sigmas, convention, costs=costs, frames=GROUP
     ):
         of_part = np.array(repetitions[: len(part.sequences)], np.int32)
         del repetitions[: len(part.sequences)]
@@ -327,21 +320,9 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
         setting: which trace, and how.
         trace: the setting's, as it was read.
     """
-    timing = None if setting.timing is None else read_trace(setting.timing.path)
-    policy = parse_policy(setting.policy)
-    source = scaled(_source(setting), setting.scale)
-    times = source(next(iter(timing or trace)))
-    engine = "batch" if batchable([times], policy) else "simpy"
-    if isinstance(source, RandomSource):
-        where = (source, setting.count, setting.fps, policy, timing, setting.first)
-        return Replayed(replay_repeated(trace, *where), engine)
-    runs = replay_trace(trace, setting.fps, source, policy, timing, batch=True)
+    runs = setting.world.replay(trace, batch=True)
+    times = runs.source(next(iter(runs.timing or trace)))
+    engine = "batch" if batchable([times], runs.policy) else "simpy"
+    if isinstance(runs.source, RandomSource):
+        return Replayed(replay_repeated(runs, setting.count, setting.first), engine)
     return Replayed(((0, run) for run in runs), engine)
-
-
-def _source(setting: Setting) -> LatencySource:
-    if setting.latency == "bootstrap":
-        return bootstrap(setting.seed, setting.block)
-    if setting.latency in RANDOM:
-        return parse_latency(f"{setting.latency}:{setting.seed}")
-    return parse_latency(setting.latency)

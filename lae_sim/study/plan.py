@@ -16,7 +16,7 @@ from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import resolve_costs
 from lae_sim.learning.folds import Trainer
 from lae_sim.learning.registry import load_any
-from lae_sim.replay.world import World, parse_latency, parse_policy
+from lae_sim.replay.world import World
 from lae_sim.study.cells import Cell, Input, Setting, Task
 from lae_sim.study.spec import RANDOM, Study
 from lae_sim.trace.file import read_trace
@@ -77,13 +77,10 @@ class Plan:
         own = {cell.setting.trace: None for cell in self.cells}
         read = {each.label: read_trace(each.path, wanted) for each in own}
         fixed = [name for name in study.latencies if name not in RANDOM] or ["recorded"]
-        world = World(
-            {name: parse_latency(name) for name in fixed},
-            study.scales,
-            study.fps[0],
-            parse_policy(study.policies[0]),
+        worlds = World.sweep(
+            policy=study.policies[0], fps=study.fps[0], latency=fixed, scale=study.scales
         )
-        return fitted(read, self.forecasters, world, study.folds, study.seed, progress)
+        return fitted(read, self.forecasters, worlds, study.folds, study.seed, progress)
 
 
 def make_plan(study: Study, base: Path | None = None) -> Plan:
@@ -117,10 +114,9 @@ def make_plan(study: Study, base: Path | None = None) -> Plan:
     codes = {name: _code(name, each, training) for name, each in forecasters.items()}
     costs = resolve_costs(study.costs, dict.fromkeys(names, Hold), ())  # none is measured
     cells = [
-        Cell(setting, name, codes[name], costs.get(name, 0), convention)
+        Cell(setting, name, codes[name], costs.get(name, 0))
         for source in traces
         for setting in _settings(study, source, timing)
-        for convention in study.conventions
         for name in forecasters
     ]
     return Plan(study, tuple(sources.values()), tuple(cells), forecasters, training)
@@ -143,27 +139,29 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
     codes = {name: _own_code(name) for name in (*study.policies, *study.latencies)}
     rates = dict.fromkeys(source.metadata.fps if fps is None else fps for fps in study.fps)
     found = []
-    for times, policy, fps, latency, scale in product(
-        [None, *theirs], study.policies, rates, study.latencies, study.scales
+    chunk = max(1, CHUNK_FRAMES // (max(source.frames, 1) * max(1, len(study.sigmas) // 8)))
+    for times, policy, fps, latency, scale, convention in product(
+        [None, *theirs], study.policies, rates, study.latencies, study.scales, study.conventions
     ):
-        chunk = max(1, CHUNK_FRAMES // (max(source.frames, 1) * max(1, len(study.sigmas) // 8)))
-        random = latency in RANDOM
+        world = World(
+            fps=fps,
+            policy=policy,
+            latency=study.seeded(latency),
+            scale=scale,
+            timing=None if times is None else times.path,
+            sigmas=study.sigmas,
+            convention=convention,
+        )
         setting = Setting(
             trace=source.input,
             timing=times,
+            world=world,
             code=codes[policy] + codes[latency],
-            policy=policy,
-            fps=fps,
-            latency=latency,
-            scale=scale,
             first=0,
             count=1,
-            seed=study.seed if random else 0,
-            block=study.block if latency == "bootstrap" else 0,
-            sigmas=study.sigmas,
             sequences=tuple(sorted(study.sequences)),
         )
-        repetitions = study.repetitions if random else 1
+        repetitions = study.repetitions if latency in RANDOM else 1
         found += [
             replace(setting, first=first, count=min(chunk, repetitions - first))
             for first in range(0, repetitions, chunk)

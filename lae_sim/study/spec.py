@@ -10,12 +10,11 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, TypeVar
 
-from lae_sim.engine.clock import parse_fps, parse_rational
+from lae_sim.engine.clock import exact, parse_fps
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.metrics import find_convention
-from lae_sim.evaluation.pairing import SIGMA_GRID
-from lae_sim.replay.world import parse_latency, parse_policy
+from lae_sim.replay.world import check_sigmas, parse_latency, parse_policy, parse_sigmas
 
 RANDOM = ("bootstrap", "resample", "lognormal")
 """Latencies that are drawn anew in each repetition."""
@@ -84,8 +83,7 @@ class Study:
             find_convention(convention)
         if "offline" in self.forecasters:
             raise LaeError("forecasters: offline is the tracker's own score, and always there")
-        if list(self.sigmas) != sorted(set(self.sigmas)) or not self.sigmas:
-            raise LaeError("sigma: permitted latencies must be ascending, each of them once")
+        check_sigmas(self.sigmas)
         if any(scale < 0 for scale in self.scales):
             raise LaeError("scales: times cannot be scaled by less than 0")
         if self.require_auc is not None and not 0 < self.require_auc < 1:
@@ -110,6 +108,13 @@ class Study:
         if "traces" not in values:
             raise LaeError("the key 'traces' is missing: name files, folders, globs or URLs")
         return cls(**values)
+
+    def seeded(self, latency: str) -> str:
+        """A latency of the study as a replay names it: random times with their seed."""
+        if latency not in RANDOM:
+            return latency
+        block = f":{self.block}" if latency == "bootstrap" else ""
+        return f"{latency}:{self.seed}{block}"
 
     def document(self) -> dict[str, Any]:
         """Plain values of everything, for provenance and digests."""
@@ -171,18 +176,12 @@ def _text(value: Any) -> str:
     return value
 
 
-def _exact(value: Any) -> Fraction:
-    if isinstance(value, bool) or not isinstance(value, (int, str, Fraction)):
-        raise LaeError(f"{value!r} is not an exact number, such as 2, 0.5 or '1/3'")
-    return value if isinstance(value, Fraction) else parse_rational(str(value))
-
-
 def _rate(value: Any) -> Fraction | None:
-    return None if value == "trace" else parse_fps(str(_exact(value)))
+    return None if value == "trace" else parse_fps(value)
 
 
 def _sigmas(value: Any) -> tuple[Fraction, ...]:
-    return SIGMA_GRID if value == "grid" else tuple(sorted(_several(_exact)(value)))
+    return parse_sigmas(value) if value == "grid" else parse_sigmas(_several(exact)(value))
 
 
 def _several(parse: Callable[[Any], Value]) -> Callable[[Any], tuple[Value, ...]]:
@@ -220,7 +219,7 @@ _KEYS: Mapping[str, tuple[str, Callable[[Any], Any]]] = {
     "policies": ("policies", _several(_text)),
     "fps": ("fps", _several(_rate)),
     "latencies": ("latencies", _several(_text)),
-    "scales": ("scales", _several(_exact)),
+    "scales": ("scales", _several(exact)),
     "sigma": ("sigmas", _sigmas),
     "conventions": ("conventions", _several(_text)),
     "costs": ("costs", _several(_text)),
@@ -230,5 +229,5 @@ _KEYS: Mapping[str, tuple[str, Callable[[Any], Any]]] = {
     "seed": ("seed", _whole(0)),
     "block": ("block", _whole(1)),
     "folds": ("folds", _whole(2)),
-    "require_auc": ("require_auc", _exact),
+    "require_auc": ("require_auc", exact),
 }

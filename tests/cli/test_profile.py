@@ -17,7 +17,7 @@ import pytest
 from fakes import bright_frame
 from places import REPOSITORY
 
-from lae_sim.replay.run import replay_trace
+from lae_sim.replay.world import replay_trace
 from lae_sim.trace.file import read_trace, validate
 
 TRACKERS = """

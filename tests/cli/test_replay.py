@@ -99,7 +99,7 @@ def test_the_table_has_a_line_for_each_trace_and_forecaster():
 def test_json_agrees_with_the_api():
     report = replay_json(SLOW, "--latency", "constant:47ms", "--sigma", "0", "1/2")["traces"][0]
     trace = lae_sim.read_trace(SLOW)
-    runs = lae_sim.replay_trace(trace, source=lae_sim.constant(47_000_000))
+    runs = lae_sim.replay_trace(trace, latency=lae_sim.constant(ns=47_000_000))
     forecasters = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
     sigmas = [Fraction(0), Fraction(1, 2)]
     found = lae_sim.evaluate(runs, trace.metadata, forecasters, sigmas)
@@ -160,7 +160,7 @@ def test_policies_by_name(policy):
     by_name = {
         "fifo": lae_sim.fifo,
         "every": lae_sim.every(2),
-        "shrinking-tail": lae_sim.shrinking_tail(47_000_000),
+        "shrinking-tail": lae_sim.shrinking_tail(ns=47_000_000),
         "vot-realtime": lae_sim.vot_realtime(),
     }
     runs = list(lae_sim.replay_trace(lae_sim.read_trace(SLOW), policy=by_name[name]))

@@ -20,6 +20,7 @@ from places import REPOSITORY
 from lae_sim.cli import show
 from lae_sim.profile.device import describe_device, readings, source_version
 from lae_sim.report.trace import overview
+from lae_sim.trace.describe import describe
 from lae_sim.trace.file import Trace, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
@@ -271,7 +272,7 @@ def test_a_busy_machine_is_pointed_out() -> None:
     document = profiled()[0].document
     device = {"cpu": {"affinity": 2}, "readings": {"before": {"load": [4.5, 1, 1]}}}
     metadata = Metadata.parse(json.dumps({**document, "device": device}).encode())
-    report, _ = show.describe(Trace(metadata, profiled()[1]), "trace")
+    report, _ = describe(Trace(metadata, profiled()[1]), "trace")
     assert (
         "the load before the profile was 4.5 on 2 cores: other programs were busy"
         in (report["warnings"])
@@ -282,7 +283,7 @@ def test_odd_figures_are_shown() -> None:
     taken = {"before": reading(1728, -5, gpu_mhz={"highest": 0})}
     device = {"memory_bytes": 10**400, "cpu": {"name": ["A", 2]}, "readings": taken}
     metadata = Metadata.new("30", "every-frame", device=device, failures="none")
-    text = overview(show.describe(Trace(metadata, profiled()[1]), "trace")[0])
+    text = overview(describe(Trace(metadata, profiled()[1]), "trace")[0])
     assert "hottest zone, C     -5.00" in text
     assert "GPU clock, MHz       0.00" in text
     assert "cpu        A; 2" in text
@@ -310,7 +311,7 @@ def test_any_metadata_is_shown(more: dict[str, Any]) -> None:
     metadata = Metadata.new("30", "every-frame", **more)
     box = np.tile([1.0, 2, 3, 4], (120, 1))
     recordings = [Recording.new("a", box, box, np.full(120, 47 * MS))]
-    report, _ = show.describe(Trace(metadata, recordings), "trace")
+    report, _ = describe(Trace(metadata, recordings), "trace")
     json.dumps(report, allow_nan=False)
     text = overview(report)
     assert "calls" in text

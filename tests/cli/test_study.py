@@ -24,9 +24,9 @@ import lae_sim
 from lae_sim.cli.study import main
 from lae_sim.comparison.forecasters import compare_forecasters
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.pairing import SIGMA_GRID
 from lae_sim.learning.trainers import KalmanTrainer
 from lae_sim.replay.latency import bootstrap, scaled
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study import rows as cell_rows
 from lae_sim.study.run import StudyResults, run_study
 from lae_sim.study.spec import Study
@@ -127,10 +127,10 @@ def test_every_row_is_what_replaying_and_scoring_one_by_one_gives(tmp_path: Path
             source = {
                 "recorded": lae_sim.by_frame,
                 "bootstrap": bootstrap(5, 7, repetition),
-                "constant:47ms": lae_sim.constant(47_000_000),
+                "constant:47ms": lae_sim.constant(ns=47_000_000),
             }[latency]
             for scale in scales:
-                runs = [*lae_sim.replay_trace(trace, source=scaled(source, scale))]
+                runs = [*lae_sim.replay_trace(trace, latency=scaled(source, scale))]
                 found = lae_sim.evaluate(runs, trace.metadata, forecasters, sigmas)
                 for f, forecaster in enumerate(forecasters):
                     for s, name in enumerate(FEW):
@@ -256,7 +256,7 @@ def test_what_a_required_auc_asks_for_is_true(tmp_path: Path) -> None:
 
     def auc(scale: str) -> float:
         source = scaled(lae_sim.by_frame, Fraction(scale))
-        runs = lae_sim.replay_trace(trace, source=source)
+        runs = lae_sim.replay_trace(trace, latency=source)
         scores = lae_sim.evaluate(runs, trace.metadata, {"hold": lae_sim.Hold}).scores["auc"]
         return float(scores.mean())
 

@@ -12,8 +12,9 @@ import pandas as pd
 import pytest
 from places import TRACES
 
-from lae_sim.comparison.forecasters import compare_forecasters, steps
+from lae_sim.comparison.forecasters import score_forecasters, steps
 from lae_sim.comparison.statistics import summarise
+from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import fifo
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate
@@ -24,8 +25,8 @@ from lae_sim.learning.folds import Examples, assign_folds
 from lae_sim.learning.registry import load_any
 from lae_sim.learning.trainers import KalmanTrainer
 from lae_sim.replay.latency import by_frame, constant, scaled
-from lae_sim.replay.run import replay_trace
-from lae_sim.replay.world import World
+from lae_sim.replay.run import Runs
+from lae_sim.replay.world import World, replay_trace
 from lae_sim.trace.file import Trace, read_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
@@ -53,7 +54,7 @@ def values(table: pd.DataFrame, **wanted: Any) -> np.ndarray:
 
 
 def test_columns_and_rows(slow: Trace) -> None:
-    table = compare_forecasters({"slow": slow}, FORECASTERS)
+    table = score_forecasters({"slow": slow}, FORECASTERS)
     assert list(table) == [*KEYS, "value"]
     assert not table.duplicated(KEYS).any()
     assert len(table) == 4 * 4 * 3  # metrics, forecasters with hold and offline, sequences
@@ -66,12 +67,14 @@ def test_columns_and_rows(slow: Trace) -> None:
 
 
 def test_every_value_is_what_evaluate_gives(slow: Trace, fast: Trace) -> None:
-    sources = {"recorded": by_frame, "constant:90ms": constant(90_000_000)}
+    sources = {"recorded": by_frame, "constant:90ms": constant(ns=90_000_000)}
     scales, sigmas = [Fraction(1, 2), Fraction(2)], [Fraction(0), Fraction(1, 3), Fraction(1)]
     fps, convention = Fraction(25), find_convention("otb")
-    world = World(sources, scales, fps, fifo)
+    worlds = World.sweep(
+        fps=fps, policy=fifo, latency=list(sources), scale=scales, sigma=sigmas, convention="otb"
+    )
     traces = {"slow": slow, "fast": fast}
-    table = compare_forecasters(traces, FORECASTERS, world, sigmas, convention)
+    table = score_forecasters(traces, FORECASTERS, worlds)
     keys = ["trace", "latency", "scale", "metric", "forecaster", "sigma"]
     got = table.groupby(keys)["value"].agg(list).to_dict()
     expected = {}
@@ -79,7 +82,7 @@ def test_every_value_is_what_evaluate_gives(slow: Trace, fast: Trace) -> None:
     for label, trace in traces.items():
         for latency, source in sources.items():
             for scale in scales:
-                runs = replay_trace(trace, fps, scaled(source, scale), fifo)
+                runs = Runs(trace, Clock.at(fps), scaled(source, scale), fifo)
                 found = evaluate(runs, trace.metadata, ready, sigmas, convention)
                 for m in METRICS:
                     here = label, latency, float(scale), m
@@ -93,8 +96,8 @@ def test_every_value_is_what_evaluate_gives(slow: Trace, fast: Trace) -> None:
 def test_the_order_of_the_traces_does_not_change_a_value(slow: Trace, fast: Trace) -> None:
     trainer = KalmanTrainer(q=(0.3, 3.0), decay=(0.95, 1.0), state=("corner",))
     forecasters = {**FORECASTERS, "tuned": trainer}
-    one = compare_forecasters({"slow": slow, "fast": fast}, forecasters, folds=3)
-    other = compare_forecasters({"fast": fast, "slow": slow}, forecasters, folds=3)
+    one = score_forecasters({"slow": slow, "fast": fast}, forecasters, folds=3)
+    other = score_forecasters({"fast": fast, "slow": slow}, forecasters, folds=3)
     assert one["trace"].iloc[0] == "slow" != other["trace"].iloc[0]
     one, other = (table.sort_values(KEYS, ignore_index=True) for table in (one, other))
     pd.testing.assert_frame_equal(one, other, check_exact=True)
@@ -117,9 +120,9 @@ class Spy:
 def test_nothing_is_trained_on_what_it_is_scored_on(slow: Trace, fast: Trace) -> None:
     spy = Spy()
     told: list[str] = []
-    world = World({"recorded": by_frame}, [Fraction(1), Fraction(2)])
-    arguments = ({"slow": slow, "fast": fast}, {"spy": spy, **FORECASTERS}, world)
-    table = compare_forecasters(*arguments, folds=3, seed=7, progress=told.append)
+    worlds = World.sweep(scale=[1, 2])
+    arguments = ({"slow": slow, "fast": fast}, {"spy": spy, **FORECASTERS}, worlds)
+    table = score_forecasters(*arguments, folds=3, seed=7, progress=told.append)
     folds = assign_folds(SEQUENCES, 3, 7)
     everything = set(SEQUENCES)
     assert spy.shown == [
@@ -136,8 +139,8 @@ def test_nothing_is_trained_on_what_it_is_scored_on(slow: Trace, fast: Trace) ->
 
 
 def test_notes_say_what_is_approximate(slow: Trace) -> None:
-    world = World({"constant:1ms": constant(1_000_000), "constant:90ms": constant(90_000_000)})
-    notes = compare_forecasters({"slow": slow}, {}, world).attrs["notes"]
+    worlds = World.sweep(latency=["constant:1ms", "constant:90ms"])
+    notes = score_forecasters({"slow": slow}, {}, worlds).attrs["notes"]
     assert notes == [
         "slow, constant:90ms: approximate, 100% of the outputs follow another frame than when "
         "recorded"
@@ -146,23 +149,21 @@ def test_notes_say_what_is_approximate(slow: Trace) -> None:
 
 def test_a_real_time_trace_is_exact_and_has_no_offline_scores() -> None:
     trace = read_trace(TRACES / "synthetic-slow-realtime.parquet", SEQUENCES)
-    table = compare_forecasters({"run": trace}, FORECASTERS)
+    table = score_forecasters({"run": trace}, FORECASTERS)
     assert np.isnan(values(table, forecaster="offline")).all()
     assert np.isfinite(table["value"][table["forecaster"] != "offline"]).all()
     assert not [note for note in table.attrs["notes"] if "approximate" in note]
     every_frame = read_trace(TRACES / "synthetic-slow.parquet", SEQUENCES)
-    again = compare_forecasters({"run": every_frame}, FORECASTERS)
+    again = score_forecasters({"run": every_frame}, FORECASTERS)
     known = table["forecaster"] != "offline"
     pd.testing.assert_frame_equal(table[known], again[known], check_exact=True)
     with pytest.raises(LaeError, match="the trace has no box for it"):
-        compare_forecasters(
-            {"run": trace}, FORECASTERS, World({"constant:1ms": constant(1_000_000)})
-        )
+        score_forecasters({"run": trace}, FORECASTERS, [World(latency="constant:1ms")])
 
 
 def test_costs_delay_the_answers(slow: Trace) -> None:
-    free = compare_forecasters({"slow": slow}, FORECASTERS)
-    table = compare_forecasters({"slow": slow}, FORECASTERS, costs=["kalman=40ms"])
+    free = score_forecasters({"slow": slow}, FORECASTERS)
+    table = score_forecasters({"slow": slow}, FORECASTERS, [World(costs=("kalman=40ms",))])
     costs = {"kalman": 40_000_000}
     runs = list(replay_trace(slow))
     found = evaluate(runs, slow.metadata, {"kalman": Kalman}, costs=costs)
@@ -174,23 +175,23 @@ def test_costs_delay_the_answers(slow: Trace) -> None:
         np.testing.assert_array_equal(got, expected)
     assert [note for note in table.attrs["notes"] if "kalman 40000 us" in note]
     with pytest.raises(LaeError, match="no forecaster 'nobody'"):
-        compare_forecasters({"slow": slow}, FORECASTERS, costs=["nobody=1ms"])
+        score_forecasters({"slow": slow}, FORECASTERS, [World(costs=("nobody=1ms",))])
 
 
 def test_forecasters_that_must_know_their_sequence(slow: Trace) -> None:
-    table = compare_forecasters({"slow": slow}, {"oracle": Oracle})
+    table = score_forecasters({"slow": slow}, {"oracle": Oracle})
     got = values(table, forecaster="oracle", metric="auc")
     np.testing.assert_allclose(got, 20 / 21, rtol=0, atol=1e-12)
 
 
 def test_what_cannot_be_compared(slow: Trace) -> None:
     with pytest.raises(LaeError, match="nothing to compare"):
-        compare_forecasters({}, FORECASTERS)
+        score_forecasters({}, FORECASTERS)
     with pytest.raises(LaeError, match="offline is the name of the tracker's own scores"):
-        compare_forecasters({"slow": slow}, {"offline": Kalman})
+        score_forecasters({"slow": slow}, {"offline": Kalman})
     alone = read_trace(TRACES / "synthetic-slow.parquet", SEQUENCES[:1])
     with pytest.raises(LaeError, match="only one video"):
-        compare_forecasters({"slow": alone}, {"tuned-kalman": load_any("tuned-kalman")})
+        score_forecasters({"slow": alone}, {"tuned-kalman": load_any("tuned-kalman")})
 
 
 def test_a_sequence_without_truth_has_no_value_where_the_convention_leaves_it_out() -> None:
@@ -201,14 +202,14 @@ def test_a_sequence_without_truth_has_no_value_where_the_convention_leaves_it_ou
         Recording.new("good", boxes, boxes, np.full(9, 10**7)),
     ]
     trace = Trace(Metadata.new("30", "every-frame"), recordings)
-    table = compare_forecasters({"a": trace}, FORECASTERS, convention=find_convention("exclude"))
+    table = score_forecasters({"a": trace}, FORECASTERS, [World(convention="exclude")])
     assert np.isnan(values(table, sequence="bare")).all()
     assert np.isfinite(values(table, sequence="good")).all()
     assert [note for note in table.attrs["notes"] if "no ground truth" in note]
     assert set(summarise(table, resamples=10)["sequences"]) == {1}
 
 
-LATENCIES = {f"constant:{ms}ms": constant(ms * 1_000_000) for ms in (20, 47, 68, 167)}
+LATENCIES = [f"constant:{ms}ms" for ms in (20, 47, 68, 167)]
 
 
 @pytest.mark.parametrize(
@@ -232,10 +233,12 @@ def test_nanotrack_on_dtb70(
                 yield Recording.new(sequence, truth, boxes[sequence], times)
 
     trace = Trace(Metadata.new("30", "every-frame"), list(recordings()))
-    table = compare_forecasters({"nano": trace}, {name: load_any(name)}, World(LATENCIES))
+    table = score_forecasters(
+        {"nano": trace}, {name: load_any(name)}, World.sweep(latency=LATENCIES)
+    )
     summary = summarise(table, metrics=["auc"], resamples=10)
     ours = summary[summary["forecaster"] == name]
-    assert list(ours["latency"]) == list(LATENCIES)
+    assert list(ours["latency"]) == LATENCIES
     assert set(ours["sequences"]) == {70}
     found = 100 * ours["recovered"].to_numpy()
     if exact:

@@ -32,9 +32,9 @@ POLICIES: dict[str, Policy] = {
     "fifo": fifo,
     "every 3": every(3),
     "every 10**18": every(10**18),
-    "shrinking tail 0": shrinking_tail(0),
-    "shrinking tail 47 ms": shrinking_tail(47 * MS),
-    "shrinking tail of a century": shrinking_tail(3 * 10**18),
+    "shrinking tail 0": shrinking_tail(ns=0),
+    "shrinking tail 47 ms": shrinking_tail(ns=47 * MS),
+    "shrinking tail of a century": shrinking_tail(ns=3 * 10**18),
 }
 Outcome = tuple[list[int], list[int], list[int]] | str
 
@@ -112,7 +112,7 @@ def test_lanes_are_scheduled_as_in_simpy(data: st.DataObject, fps: str, policy: 
     assert at_once(lengths, clock, anew, policy) == expected
 
 
-@pytest.mark.parametrize("policy", [*list(POLICIES.values())[:3], shrinking_tail(47 * MS)])
+@pytest.mark.parametrize("policy", [*list(POLICIES.values())[:3], shrinking_tail(ns=47 * MS)])
 @pytest.mark.usefixtures("no_simpy")
 def test_lanes_need_no_simpy(policy: Policy) -> None:
     clock = Clock.at(Fraction(30000, 1001))
@@ -136,7 +136,7 @@ def test_a_gap_that_is_never_asked_for_is_none() -> None:
 @pytest.mark.parametrize("fps", ["30", "1/3"])
 @pytest.mark.parametrize("factor", ["1", "2", "1/3", "1001/1000", "123456789/7"])
 @pytest.mark.parametrize(
-    "source", [by_frame, by_call, constant(47 * MS), resampled(1), lognormal(1)]
+    "source", [by_frame, by_call, constant(ns=47 * MS), resampled(1), lognormal(1)]
 )
 def test_sources_of_the_package_are_batched(source, factor: str, fps: str) -> None:  # type: ignore[no-untyped-def]
     random = np.random.default_rng(0)

@@ -47,13 +47,13 @@ def run(elapsed_ms: Sequence[int], policy: Policy) -> list[tuple[int, float, flo
         (every(3), [10] * 5, [(0, 0, 10), (3, 120, 130)]),
         (every(9), [10] * 5, [(0, 0, 10)]),
         # r = 60: free at 70, tail 30 of 40; 70 + 60 = 130, tail 10 < 30: wait for frame 2 at 80
-        (shrinking_tail(60 * MS), [70] + [60] * 4, [(0, 0, 70), (2, 80, 140), (4, 160, 220)]),
+        (shrinking_tail(ns=60 * MS), [70] + [60] * 4, [(0, 0, 70), (2, 80, 140), (4, 160, 220)]),
         # r = 60: free at 50, tail 10; 110 has tail 30: start frame 1 at once
-        (shrinking_tail(60 * MS), [50] + [60] * 3, [(0, 0, 50), (1, 50, 110), (3, 120, 180)]),
+        (shrinking_tail(ns=60 * MS), [50] + [60] * 3, [(0, 0, 50), (1, 50, 110), (3, 120, 180)]),
         # equal tails do not wait: r = 80
-        (shrinking_tail(80 * MS), [50] + [80] * 3, [(0, 0, 50), (1, 50, 130), (3, 130, 210)]),
+        (shrinking_tail(ns=80 * MS), [50] + [80] * 3, [(0, 0, 50), (1, 50, 130), (3, 130, 210)]),
         # a tracker as fast as the camera never waits
-        (shrinking_tail(40 * MS), [50] + [30] * 3,
+        (shrinking_tail(ns=40 * MS), [50] + [30] * 3,
          [(0, 0, 50), (1, 50, 80), (2, 80, 110), (3, 120, 150)]),
         # 60 over the interval of 40 owes 20, less than one interval: no frame is skipped
         (vot_realtime(0), [60] * 3, [(0, 0, 60), (1, 40, 100), (2, 80, 140)]),
@@ -93,7 +93,7 @@ def test_shrinking_tail_waits_iff_the_tail_shrinks(data: st.DataObject, fps: Fra
     ready_ns, expected_ns = data.draw(times(fps, 2))
     clock = Clock.at(fps)
     call = (0, 0, ready_ns * clock.ticks_per_ns)
-    frame, start = shrinking_tail(expected_ns)(clock, [call])
+    frame, start = shrinking_tail(ns=expected_ns)(clock, [call])
     s, r = ready_ns * fps / SECOND, expected_ns * fps / SECOND  # in frames
     waits = r > 1 and tail(s + r) < tail(s)
     expected = math.floor(s) + 1 if waits else max(math.floor(s), 1)
@@ -109,7 +109,7 @@ def test_a_tracker_within_one_interval_never_waits(
     interval = int(SECOND / fps)
     clock = Clock.at(fps)
     eager = simulate(length, clock, elapsed.__getitem__, latest)
-    patient = simulate(length, clock, elapsed.__getitem__, shrinking_tail(interval))
+    patient = simulate(length, clock, elapsed.__getitem__, shrinking_tail(ns=interval))
     assert patient.start.tolist() == eager.start.tolist()
 
 

@@ -94,8 +94,8 @@ POLICIES: dict[str, Policy] = {
     "fifo": fifo,
     "every 2": every(2),
     "every 3": every(3),
-    "shrinking tail 47 ms": shrinking_tail(47_000_000),
-    "shrinking tail 100 ms": shrinking_tail(100_000_000),
+    "shrinking tail 47 ms": shrinking_tail(ns=47_000_000),
+    "shrinking tail 100 ms": shrinking_tail(ns=100_000_000),
     "vot": vot_realtime(),
     "vot without grace": vot_realtime(0),
 }
@@ -237,7 +237,7 @@ def test_departures_count_outputs_that_follow_another_frame_than_recorded() -> N
     run = replay_sequence(recording, CLOCK)
     assert run.schedule.frames.tolist() == [0, 2, 5, 7, 10, 12, 15, 17]
     assert run.departures == 7
-    assert replay_sequence(recording, CLOCK, constant(0)).departures == 0
+    assert replay_sequence(recording, CLOCK, constant(ns=0)).departures == 0
 
 
 def test_departures_of_a_real_time_trace_under_other_times() -> None:
@@ -264,7 +264,7 @@ def test_departures_of_a_trace_of_every_frame_are_its_skips(world: World, n: int
     assert run.departures == (0 if n == 1 else len(run.schedule.frames) - 1)
 
 
-@pytest.mark.parametrize("source", [by_frame, constant(50_000_000)])
+@pytest.mark.parametrize("source", [by_frame, constant(ns=50_000_000)])
 def test_a_frame_that_the_trace_lacks_is_named(source: object) -> None:
     boxes = np.ones((9, 4))
     elapsed = np.full(9, 50_000_000)

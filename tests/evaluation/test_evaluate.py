@@ -30,11 +30,11 @@ from lae_sim.engine.policies import vot_realtime
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import Evaluation, answers, evaluate
 from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, precision_curve, success_curve
-from lae_sim.evaluation.pairing import SIGMA_GRID
 from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
 from lae_sim.replay.latency import constant
 from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
@@ -208,7 +208,7 @@ def test_kalman_lae_pvt_agrees_with_matrices_through_answers() -> None:
     metadata = Metadata.new("30", "every-frame", sequences={"a": {"image_size": list(size)}})
     for seed in range(6):
         recording = moving(150, seed)
-        run = replay_sequence(recording, CLOCK, constant(90_000_000))
+        run = replay_sequence(recording, CLOCK, constant(ns=90_000_000))
         for sigma in (Fraction(0), Fraction(1, 2), Fraction(-1)):
             told = answers(run, metadata, "kalman-lae-pvt", KalmanLaePvt, sigma)
             expected = follow(

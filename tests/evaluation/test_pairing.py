@@ -15,7 +15,8 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import every, latest, vot_realtime
 from lae_sim.engine.scheduler import Schedule, simulate
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.pairing import SIGMA_GRID, Pairing, histories, pair, pairs, ranges
+from lae_sim.evaluation.pairing import Pairing, histories, pair, pairs, ranges
+from lae_sim.replay.world import SIGMA_GRID
 
 World = tuple[Fraction, list[int], list[list[float]]]
 CLOCK = Clock.at(Fraction(25))  # 40 ms a frame

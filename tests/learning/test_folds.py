@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from witness import moving, psi, schedule_latest, worlds
 
-from lae_sim.comparison.forecasters import compare_forecasters
+from lae_sim.comparison.forecasters import score_forecasters
 from lae_sim.datasets.annotations import video_of
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate
 from lae_sim.forecast.base import Hold
 from lae_sim.learning.folds import CrossFitted, Examples, assign_folds, cross_fitted
-from lae_sim.replay.latency import by_frame, constant
+from lae_sim.replay.latency import constant
 from lae_sim.replay.run import replay_sequence
 from lae_sim.replay.world import World
 from lae_sim.trace.file import Trace
@@ -97,7 +97,7 @@ A, B, C = (moving(n, seed, name) for n, seed, name in ((20, 1, "a"), (9, 2, "b")
 
 
 def test_joined_examples_are_those_of_its_parts() -> None:
-    parts = [examples_of([A, C]), examples_of([B, C], source=constant(90_000_000))]
+    parts = [examples_of([A, C]), examples_of([B, C], source=constant(ns=90_000_000))]
     joined = Examples.joined(parts)
     assert joined.sequences == ("a", "c", "b", "c")
     assert rows_of(joined) == rows_of(parts[0]) + rows_of(parts[1])
@@ -233,9 +233,9 @@ def test_no_comparison_scores_what_it_has_trained_on(folds: int) -> None:
     """Two traces share sequences; all replays of a sequence are held out together."""
     metadata = Metadata.new("30", "every-frame")
     traces = {"one": Trace(metadata, RECORDINGS[:6]), "two": Trace(metadata, RECORDINGS[2:])}
-    world = World({"recorded": by_frame, "slow": constant(95_000_000)}, [Fraction(1), Fraction(2)])
+    worlds = World.sweep(latency=["recorded", "constant:95ms"], scale=[1, 2])
     trainers = {"fake": FakeTrainer(), "other": FakeTrainer()}
-    table = compare_forecasters(traces, trainers, world, folds=folds, seed=folds)
+    table = score_forecasters(traces, trainers, worlds, folds=folds, seed=folds)
     for trainer in trainers.values():
         assert_honest(trainer, min(folds, 6))
         assert len(trainer.scored) == 4 * (6 + 7)
@@ -258,7 +258,7 @@ def test_the_two_traces_are_no_way_around_it() -> None:
         for name, kept in {"one": ("car1_1", "dog"), "two": ("car1_2", "van")}.items()
     }
     trainer = FakeTrainer()
-    compare_forecasters(traces, {"fake": trainer}, folds=3)
+    score_forecasters(traces, {"fake": trainer}, folds=3)
     assert_honest(trainer, 3, ["car1_1", "car1_2", "dog", "van"])
 
 

@@ -24,7 +24,7 @@ from lae_sim.trace.recording import Recording
 
 
 def examples_of(recordings: list[Recording], elapsed_ns: int = 90_000_000) -> Examples:
-    clock, source = Clock.at(Fraction(30)), constant(elapsed_ns)
+    clock, source = Clock.at(Fraction(30)), constant(ns=elapsed_ns)
     return Examples.of([replay_sequence(recording, clock, source) for recording in recordings])
 
 
@@ -103,7 +103,7 @@ def test_missing_truth_and_missing_boxes_do_no_harm(torch: Any) -> None:
     whole = moving(60, 3)
     truth = whole.truth.copy()
     truth[::3], truth[1] = np.nan, [5, 5, 0, 0]
-    frames = replay_sequence(whole, Clock.at(Fraction(30)), constant(90_000_000)).schedule.frames
+    frames = replay_sequence(whole, Clock.at(Fraction(30)), constant(ns=90_000_000)).schedule.frames
     boxes, elapsed = np.full((60, 4), np.nan), np.full(60, -1)
     boxes[frames], elapsed[frames] = whole.boxes[frames], 1
     for recording in (

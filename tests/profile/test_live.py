@@ -27,7 +27,8 @@ from lae_sim.forecast.window import LeastSquares, Windowed
 from lae_sim.profile.live import LiveRun, run_every_frame, run_real_time, search_of
 from lae_sim.profile.timed import Answer, TrackerError
 from lae_sim.replay.latency import constant
-from lae_sim.replay.run import Run, replay_sequence, replay_trace
+from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.replay.world import replay_trace
 from lae_sim.trace.file import Trace, read_trace, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
@@ -62,7 +63,7 @@ def assert_equal(found: Run, run: LiveRun) -> None:
 POLICIES = st.one_of(
     st.sampled_from([latest, fifo, vot_realtime(), vot_realtime(0)]),
     st.integers(1, 5).map(every),
-    st.integers(0, 4 * FRAME_NS).map(shrinking_tail),
+    st.integers(0, 4 * FRAME_NS).map(lambda ns: shrinking_tail(ns=ns)),
 )
 
 
@@ -374,7 +375,7 @@ def test_strided_passes_make_a_replay_at_their_stride_exact(stride: int, at: int
     ]
     timing = Trace(Metadata.new("30", "real-time"), [closed.recording])
     (bare,) = replay_trace(whole, timing=timing)
-    (found,) = replay_trace(whole, timing=timing, strided=strided)
+    (found,) = replay_trace(whole, timing=timing, passes=strided)
     np.testing.assert_array_equal(found.schedule.frames, closed.frames)
     np.testing.assert_array_equal(found.boxes, closed.recording.boxes[closed.frames])
     assert found.departures == 0 < bare.departures
@@ -389,7 +390,7 @@ def test_each_stride_once() -> None:
     recording = Recording.new("a", [[1, 1, 1, 1]], [[1, 1, 1, 1]], [1])
     trace = Trace(Metadata.new("30", "every-frame"), [recording])
     with pytest.raises(LaeError, match="stride"):
-        list(replay_trace(trace, strided=[trace]))
+        list(replay_trace(trace, passes=[trace]))
 
 
 def test_passes_that_part_are_told() -> None:
@@ -407,6 +408,6 @@ def test_passes_that_part_are_told() -> None:
     np.testing.assert_array_equal(run.boxes, np.array(near)[frames])  # 15/10 is halfway: the lower
     assert run.departures == 5
     assert run.disagreement == pytest.approx(5 / 11)
-    run = replay_sequence(every, CLOCK, constant(70_000_000), strided={Fraction(2): half})
+    run = replay_sequence(every, CLOCK, constant(ns=70_000_000), strided={Fraction(2): half})
     np.testing.assert_array_equal(run.boxes, np.array(far)[run.schedule.frames])
     assert run.recording is every  # what is scored offline

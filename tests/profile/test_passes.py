@@ -55,7 +55,7 @@ def test_the_warm_up_is_made_up_for_after_a_bad_first_sequence(tmp_path: Path) -
     tracker = FakeTimed()
     journal = Journal(tmp_path / "t.unfinished", {}, resume=False)
     failures = ran(a_pass(tmp_path, tracker), tracker, journal, "xyz", warmup=3)
-    assert [failure["sequence"] for failure in failures] == ["x"]
+    assert [failure.sequence for failure in failures] == ["x"]
     assert len(tracker.frames) == 3 + 2 * 5
 
 
@@ -65,7 +65,7 @@ def test_a_failing_warm_up_names_the_sequence(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "t.unfinished", {}, resume=False)
     dataset = Dataset("d", Fraction(30), [odd])
     (failure,) = run_pass(a_pass(tmp_path, tracker), dataset, tracker, journal, 2, print)
-    assert "sequence 'odd', frame 0: a frame must be uint8" in failure["reason"]
+    assert "sequence 'odd', frame 0: a frame must be uint8" in failure.reason
 
 
 def test_a_resumed_pass_is_one_trace_of_both_runs(tmp_path: Path) -> None:

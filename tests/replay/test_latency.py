@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lae_sim.engine.clock import Clock
+from lae_sim.engine.policies import shrinking_tail
 from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError
 from lae_sim.replay.latency import (
@@ -77,7 +78,7 @@ def test_by_call_starts_anew_for_each_service() -> None:
 
 
 def test_constant_times_every_call_alike() -> None:
-    assert draws(constant(47), 3) == [47, 47, 47]
+    assert draws(constant(ns=47), 3) == [47, 47, 47]
 
 
 @pytest.mark.parametrize(
@@ -110,18 +111,29 @@ def test_a_service_of_ones_own_is_scaled_call_by_call() -> None:
 
 def test_a_constant_below_zero_is_refused() -> None:
     with pytest.raises(LaeError, match="negative"):
-        constant(-1)
+        constant(ns=-1)
 
 
 def test_a_constant_in_float_seconds_is_refused() -> None:
     with pytest.raises(TypeError):
-        constant(0.047)  # type: ignore[arg-type]
+        constant(ns=0.047)  # type: ignore[arg-type]
+
+
+def test_a_bare_number_is_no_duration() -> None:
+    for wrong in (47, 0.047, "47"):
+        with pytest.raises(LaeError, match=f"^{wrong!r} is not a duration: write it with its unit"):
+            constant(wrong)  # type: ignore[arg-type]
+        with pytest.raises(LaeError, match="is not a duration"):
+            shrinking_tail(wrong)  # type: ignore[arg-type]
+    with pytest.raises(LaeError, match="give a duration as text with its unit"):
+        constant()
+    assert draws(constant("47ms"), 2) == [47_000_000] * 2
 
 
 def test_scaling_does_not_pass_through_floats() -> None:
     big = 2**60 + 1
-    assert draws(scaled(constant(big), Fraction(3)), 1) == [3 * big]
-    assert draws(scaled(constant(3 * big), Fraction(1, 3)), 1) == [big]
+    assert draws(scaled(constant(ns=big), Fraction(3)), 1) == [3 * big]
+    assert draws(scaled(constant(ns=3 * big), Fraction(1, 3)), 1) == [big]
 
 
 def test_a_factor_below_zero_is_refused() -> None:
@@ -370,7 +382,7 @@ def test_a_block_without_calls_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "make", [by_frame, by_call, resampled(1), lognormal(1), bootstrap(1), constant(10)]
+    "make", [by_frame, by_call, resampled(1), lognormal(1), bootstrap(1), constant(ns=10)]
 )
 def test_a_source_can_drive_a_replay(make: LatencySource) -> None:
     run = replay_sequence(recording([40_000_000] * 5), Clock.at(Fraction(25)), make)

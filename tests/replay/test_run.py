@@ -26,7 +26,8 @@ from lae_sim.replay.latency import (
     resampled,
     scaled,
 )
-from lae_sim.replay.run import Run, replay_repeated, replay_trace
+from lae_sim.replay.run import Run, replay_repeated
+from lae_sim.replay.world import replay_trace
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
@@ -67,15 +68,15 @@ def backwards_at_40(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
 @pytest.mark.usefixtures("groups")
 @pytest.mark.parametrize("policy", [latest, every(2), vot_realtime()])
 @pytest.mark.parametrize(
-    "source", [by_frame, by_call, constant(47_000_000), scaled(bootstrap(3), Fraction(2))]
+    "source", [by_frame, by_call, constant(ns=47_000_000), scaled(bootstrap(3), Fraction(2))]
 )
 def test_a_batch_gives_the_same_runs(source: LatencySource, policy: Policy) -> None:
     half = Trace(replace(EVERY, document={**EVERY.document, "schedule": {
         "kind": "every-frame", "stride": "2"}}), SLOWER.recordings)  # fmt: skip
     assert half.metadata.stride == 2
-    for options in ({}, {"timing": SLOWER}, {"strided": [half]}, {"fps": Fraction(30000, 1001)}):
-        alone = replay_trace(TRACE, source=source, policy=policy, **options)  # type: ignore[arg-type]
-        together = replay_trace(TRACE, source=source, policy=policy, batch=True, **options)  # type: ignore[arg-type]
+    for options in ({}, {"timing": SLOWER}, {"passes": [half]}, {"fps": Fraction(30000, 1001)}):
+        alone = replay_trace(TRACE, latency=source, policy=policy, **options)  # type: ignore[arg-type]
+        together = replay_trace(TRACE, latency=source, policy=policy, batch=True, **options)  # type: ignore[arg-type]
         assert [fields(r) for r in together] == [fields(r) for r in alone]
 
 
@@ -106,15 +107,14 @@ def gappy() -> Trace:
 @pytest.mark.parametrize("timing", [None, SLOWER])
 def test_repetitions_are_replays(make, policy: Policy, timing: Trace | None) -> None:  # type: ignore[no-untyped-def]
     found = {}
-    for repetition, replayed in replay_repeated(
-        TRACE, make(7), 3, policy=policy, timing=timing, first=2
-    ):
+    runs = replay_trace(TRACE, latency=make(7), policy=policy, timing=timing)
+    for repetition, replayed in replay_repeated(runs, 3, first=2):
         found[repetition, replayed.recording.name] = fields(replayed)
     expected = {
         (repetition, replayed.recording.name): fields(replayed)
         for repetition in (2, 3, 4)
         for replayed in replay_trace(
-            TRACE, source=make(7, repetition=repetition), policy=policy, timing=timing
+            TRACE, latency=make(7, repetition=repetition), policy=policy, timing=timing
         )
     }
     assert found == expected
@@ -122,14 +122,16 @@ def test_repetitions_are_replays(make, policy: Policy, timing: Trace | None) -> 
 
 @pytest.mark.usefixtures("groups")
 def test_repetitions_do_not_depend_on_other_sequences() -> None:
-    alone = Trace(EVERY, [moving(20 + 7 * 4, 4, "s04")])
-    among = [
-        fields(r) for _, r in replay_repeated(TRACE, bootstrap(7), 5) if r.recording.name == "s04"
-    ]
-    assert among == [fields(r) for _, r in replay_repeated(alone, bootstrap(7), 5)]
+    drawn = replay_trace(TRACE, latency=bootstrap(7))
+    alone = replay_trace(Trace(EVERY, [moving(20 + 7 * 4, 4, "s04")]), latency=bootstrap(7))
+    among = [fields(r) for _, r in replay_repeated(drawn, 5) if r.recording.name == "s04"]
+    assert among == [fields(r) for _, r in replay_repeated(alone, 5)]
 
 
 def test_repetitions_come_one_after_another() -> None:
-    found = [(k, r.recording.name) for k, r in replay_repeated(TRACE, bootstrap(7), 2)]
+    runs = replay_trace(TRACE, latency=bootstrap(7))
+    found = [(k, r.recording.name) for k, r in replay_repeated(runs, 2)]
     assert found == [(k, name) for k in range(2) for name in NAMES]
-    assert list(replay_repeated(TRACE, bootstrap(7), 0)) == []
+    assert list(replay_repeated(runs, 0)) == []
+    with pytest.raises(LaeError, match="only random times can be drawn again"):
+        next(replay_repeated(replay_trace(TRACE), 2))

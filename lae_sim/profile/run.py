@@ -1,0 +1,340 @@
+"""A whole profile: a tracker run on a dataset in one or more passes, each left as a trace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, fields
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from lae_sim import __version__
+from lae_sim.datasets.frames import Dataset, ImageSequence
+from lae_sim.datasets.layouts import find_dataset
+from lae_sim.engine.clock import NS_PER_SECOND, Clock, parse_duration, parse_fps, parse_stride
+from lae_sim.errors import LaeError
+from lae_sim.files import check_distinct
+from lae_sim.forecast.camera import Camera
+from lae_sim.forecast.costs import parse_cost
+from lae_sim.learning.registry import load_forecaster
+from lae_sim.profile.journal import Journal
+from lae_sim.profile.live import LiveRun, run_every_frame, run_real_time
+from lae_sim.profile.passes import (
+    Failure,
+    Pass,
+    PassSummary,
+    Progress,
+    base_document,
+    parse_timing,
+    run_pass,
+    scheduled,
+    summary,
+    warm_up,
+    write_pass,
+)
+from lae_sim.profile.timed import TimedTracker
+from lae_sim.profile.translation import Translated
+from lae_sim.profile.worker import InProcess, Worker
+from lae_sim.replay.strides import phases
+from lae_sim.replay.world import parse_policy
+from lae_sim.trace.file import read_trace
+
+MODES = ("every-frame", "real-time")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfilePlan:
+    """All that decides what a profile measures.
+
+    Attributes:
+        tracker: its name (see :func:`lae_sim.trackers.names.make_tracker`).
+        options: keyword arguments of its factory (JSON values).
+        translate: set the search by shifting the frame, even where the tracker can be told.
+        python: interpreter of the worker process, 3.8 or newer; this one if None.
+        in_process: run the tracker in this process, without timeouts: for debugging.
+        threads: that the tracker's libraries may use; None leaves them as they are.
+        frame_timeout: what a call may take before its sequence is given up, ns.
+        warmup: calls before anything is measured.
+        dataset, root, sequences, box, fps: the frames (see
+            :func:`lae_sim.datasets.layouts.find_dataset`).
+        mode: ``"every-frame"``, or ``"real-time"`` to skip frames while the tracker is busy; by
+            default real-time with a ``policy`` or a ``timing``, otherwise every frame.
+        policy: which frame a free tracker takes (see :func:`lae_sim.replay.world.parse_policy`);
+            latest if None. Real-time only.
+        pre_forecaster: name of the forecaster that sets the search region before each frame.
+        pre_forecaster_cost: what it adds to a frame's time, ns; None to measure it.
+        keep_size: predict the centre of the search region only.
+        timing: times that the schedule follows instead of the measured ones (see
+            :func:`lae_sim.profile.passes.parse_timing`). Real-time only.
+        strides: further passes on every N-th frame, each above 1.
+        closed_loops: further real-time passes under these times, as of ``timing``.
+        repeat: how often the first pass is run.
+        include_decode: whether times include the decoding of frames.
+
+    Raises:
+        LaeError: if some do not go together.
+    """
+
+    tracker: str = "dcf"
+    options: Mapping[str, Any] = field(default_factory=dict)
+    translate: bool = False
+    python: str | None = None
+    in_process: bool = False
+    threads: int | None = None
+    frame_timeout: int = 30 * NS_PER_SECOND
+    warmup: int = 5
+    dataset: str | None = None
+    root: str | Path | None = None
+    sequences: Sequence[str] | None = None
+    box: Sequence[float] | None = None
+    fps: Fraction | None = None
+    mode: str | None = None
+    policy: str | None = None
+    pre_forecaster: str | None = None
+    pre_forecaster_cost: int | None = 0
+    keep_size: bool = False
+    timing: str | None = None
+    strides: Sequence[Fraction] = ()
+    closed_loops: Sequence[str] = ()
+    repeat: int = 1
+    include_decode: bool = False
+
+    def __post_init__(self) -> None:
+        if self.mode not in (None, *MODES):
+            raise LaeError(f"no mode {self.mode!r}: there are {' and '.join(MODES)}")
+        if not self.real_time and (self.policy or self.timing):
+            raise LaeError("--policy and --timing are for --mode real-time")
+        if self.real_time and (self.strides or self.closed_loops):
+            raise LaeError("--stride and --closed-loop go with --mode every-frame")
+        if (self.translate or self.keep_size) and self.pre_forecaster is None:
+            raise LaeError("--translate and --keep-size are ways to use a --pre-forecaster")
+
+    @classmethod
+    def of(cls, **settings: Any) -> ProfilePlan:
+        """A plan from text and plain numbers, as command lines have them.
+
+        Args:
+            settings: the attributes by name; ``fps`` and ``strides`` may be text (``"30000/1001"``,
+                ``"3/2"``) or numbers, ``frame_timeout`` and ``pre_forecaster_cost`` text
+                (``"2ms"``, ``"measured"``).
+
+        Raises:
+            LaeError: if a value is impossible, or some do not go together.
+        """
+        exact = dict(settings)
+        if exact.get("fps") is not None:
+            exact["fps"] = parse_fps(exact["fps"])
+        if "strides" in exact:
+            exact["strides"] = tuple(map(parse_stride, exact["strides"]))
+        for name, parse in (("frame_timeout", parse_duration), ("pre_forecaster_cost", parse_cost)):
+            if isinstance(exact.get(name), str):
+                exact[name] = parse(exact[name])
+        return cls(**exact)
+
+    @property
+    def real_time(self) -> bool:
+        """Whether the first pass skips frames while the tracker is busy."""
+        if self.mode is None:
+            return bool(self.policy or self.timing)
+        return self.mode == "real-time"
+
+    def settings(self) -> dict[str, str]:
+        """The fields as text, for a resumed profile to compare."""
+        return {each.name: str(getattr(self, each.name)) for each in fields(self)}
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What a profile left.
+
+    Attributes:
+        traces: of the passes; none if there was nothing to resume.
+        failures: the sequences that failed, of all passes.
+    """
+
+    traces: tuple[PassSummary, ...]
+    failures: tuple[Failure, ...]
+
+
+def profile_tracker(
+    tracker: str = "dcf",
+    *,
+    out: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+    notice: Callable[[str], object] = lambda text: None,
+    **settings: Any,
+) -> Profile:
+    """Run a tracker on this device and write a trace of each pass.
+
+    What is finished is kept beside the trace until all is, so that an interrupted profile can be
+    resumed. On Ctrl-C the traces of what is complete are written before it is raised again.
+
+    Args:
+        tracker: its name (see :func:`lae_sim.trackers.names.make_tracker`).
+        out: the first trace, ``.parquet``; further passes are written beside it. By default
+            ``TRACKER-DATASET.parquet`` in the current folder.
+        resume: whether to go on with a profile that was interrupted.
+        progress: ``progress(done, total)`` is called with world frames, before the first and after
+            each.
+        notice: called with each line that a user should read.
+        settings: attributes of :class:`ProfilePlan`, as :meth:`ProfilePlan.of` takes them.
+
+    Raises:
+        LaeError: if something cannot be used, or no sequence could be profiled.
+    """
+    plan = ProfilePlan.of(tracker=tracker, **settings)
+    dataset = find_dataset(plan.dataset, plan.root, plan.sequences, plan.box, plan.fps)
+    path = _trace_path(out, f"{tracker}-{dataset.name}")
+    unfinished = path.with_suffix(".unfinished")
+    if resume and path.exists() and not unfinished.exists():
+        metadata = read_trace(path).metadata
+        notice(
+            f"{path} is complete ({metadata.tracker} on {metadata.dataset}): nothing to resume; "
+            "remove it to profile anew"
+        )
+        return Profile((), ())
+    if path.exists() and not resume:
+        notice(f"{path} will be replaced")
+    failures: dict[str, list[Failure]] = {}
+    interrupted = False
+    with closing(_start(plan, notice)) as started:
+        with suppress(LaeError):  # a tracker may import libraries, or reach the GPU, only now
+            warm_up(started, dataset.sequences[0], min(plan.warmup, 1))
+        passes = _passes(plan, dataset, started, path)
+        described = {f"tracker's {key}": value for key, value in started.describe().items()}
+        settled = {"lae_sim": __version__, **plan.settings(), **described}
+        journal = Journal(unfinished, settled, resume)
+        total = sum(map(len, dataset.sequences)) * sum(task.rounds for task in passes)
+        done = 0
+
+        def advance(frames: int) -> None:
+            nonlocal done
+            done += frames
+            progress(done, total)
+
+        advance(0)
+        try:
+            for task in passes:
+                failures[task.name] = run_pass(
+                    task,
+                    dataset,
+                    started,
+                    journal,
+                    plan.warmup,
+                    advance,
+                    buffered=not plan.include_decode,
+                )
+        except KeyboardInterrupt:
+            interrupted = True
+    written = [task for task in passes if write_pass(task, journal, failures.get(task.name, []))]
+    if not interrupted:
+        journal.remove()
+    failed = tuple(failure for each in failures.values() for failure in each)
+    for failure in failed:
+        notice(f"failed: {failure.reason}")
+    if interrupted:
+        kept = f"{path} holds what is complete; " if written else ""
+        notice(f"{kept}--resume goes on")
+        raise KeyboardInterrupt
+    if not written:
+        raise LaeError("no sequence could be profiled")
+    return Profile(tuple(summary(task.path) for task in written), failed)
+
+
+def _trace_path(out: str | Path | None, name: str) -> Path:
+    """The path of the first trace, by default of the name's letters and digits."""
+    if out is None:
+        return Path("".join(c if c.isalnum() or c in "-_" else "-" for c in name) + ".parquet")
+    if not str(out).endswith(".parquet"):
+        raise LaeError(f"--out {out}: call the trace something.parquet")
+    return Path(out)
+
+
+def _start(plan: ProfilePlan, notice: Callable[[str], object]) -> TimedTracker:
+    """The tracker, in a worker process unless asked otherwise, under translation if needed."""
+    tracker: TimedTracker
+    if plan.in_process:
+        tracker = InProcess(plan.tracker, plan.options, threads=plan.threads)
+    else:
+        tracker = Worker(
+            plan.tracker,
+            plan.options,
+            python=plan.python,
+            threads=plan.threads,
+            timeout=plan.frame_timeout / NS_PER_SECOND,
+        )
+    needed = plan.pre_forecaster is not None and not tracker.sets_search
+    if needed:
+        notice("the tracker has no set_search, so frames are shifted")
+    return Translated(tracker) if plan.translate or needed else tracker
+
+
+def _passes(plan: ProfilePlan, dataset: Dataset, tracker: TimedTracker, out: Path) -> list[Pass]:
+    """The first pass and its repetitions, the strided ones and the closed loops."""
+    clock = Clock.at(dataset.fps)
+    policy_name = plan.policy or "latest"
+    policy = parse_policy(policy_name)
+    includes = "init and track calls" + (
+        " and the decoding of frames" if plan.include_decode else "; frames decoded before"
+    )
+    document = base_document(plan.tracker, tracker, dataset.name, clock, plan.warmup, includes)
+    live: dict[str, Any] = {"tracker": tracker, "include_decode": plan.include_decode}
+    if plan.pre_forecaster is not None:
+        cost = plan.pre_forecaster_cost
+        camera = Camera({}, dataset.fps)  # a live sequence brings its frames
+        live["pre_forecaster"] = load_forecaster(plan.pre_forecaster, camera)
+        live["forecaster_ns"], live["keep_size"] = cost, plan.keep_size
+        document["schedule"] = {
+            "pre_forecaster": plan.pre_forecaster,
+            "pre_forecaster_cost": "measured" if cost is None else f"{cost} ns",
+            "search": "translation" if isinstance(tracker, Translated) else "native",
+            "keep_size": plan.keep_size,
+        }
+
+    def new_pass(name: str, run: Callable[..., LiveRun], rounds: int = 1, **schedule: Any) -> Pass:
+        path = out.with_suffix(f".{name}.parquet") if name else out
+        return Pass(name or "first", path, scheduled(document, **schedule), run, rounds)
+
+    def real_time(name: str, timing: str | None) -> Pass:
+        source, times = parse_timing(timing) if timing else ("measured", None)
+
+        def run(sequence: ImageSequence, progress: Progress) -> LiveRun:
+            service = times(sequence) if times else None
+            return run_real_time(
+                sequence, clock=clock, policy=policy, service=service, progress=progress, **live
+            )
+
+        return new_pass(name, run, kind="real-time", policy=policy_name, source=source)
+
+    def every_frame(name: str) -> Pass:
+        return new_pass(name, partial(run_every_frame, **live), kind="every-frame")
+
+    def strided(stride: Fraction) -> Pass:
+        return new_pass(
+            f"stride{stride}".replace("/", "-"),
+            partial(run_every_frame, stride=stride, **live),
+            rounds=len(phases(stride, 4 * stride.numerator)),
+            kind="every-frame",
+            stride=str(stride),
+        )
+
+    names = ["", *(f"repeat{n}" for n in range(2, plan.repeat + 1))]
+    passes = [real_time(n, plan.timing) if plan.real_time else every_frame(n) for n in names]
+    passes += [strided(stride) for stride in dict.fromkeys(plan.strides)]
+    passes += [
+        real_time(f"closed-loop-{_short(timing)}", timing)
+        for timing in dict.fromkeys(plan.closed_loops)
+    ]
+    times = [timing for timing in (plan.timing, *plan.closed_loops) if timing]
+    traces = [timing for timing in times if not timing.startswith("constant:")]
+    check_distinct([each.path for each in passes], traces)
+    return passes
+
+
+def _short(timing: str) -> str:
+    """What tells a closed loop's trace from others."""
+    constant = timing.startswith("constant:")
+    return timing.removeprefix("constant:") if constant else Path(timing).stem
