@@ -18,7 +18,7 @@ import numpy as np
 
 from lae_sim.profile.timed import TimedTracker
 from lae_sim.profile.worker import InProcess, Worker
-from lae_sim.report.table import table
+from lae_sim.report.table import aligned
 from lae_sim.trackers.protocol import Image
 
 WORK_NS = 5_000_000
@@ -89,7 +89,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--calls", type=int, default=400, help="of the tracker (default: 400)")
     found = lines(parser.parse_args().calls)
-    print(table(["5 ms tracker", "what", "median", "ratio to the work", "target"], found))
+    print(aligned(["5 ms tracker", "what", "median", "ratio to the work", "target"], found))
 
 
 if __name__ == "__main__":

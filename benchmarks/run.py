@@ -22,11 +22,11 @@ import simpy
 from filterpy.kalman import KalmanFilter
 
 from lae_sim import Clock, Metadata, Recording, Trace, latest, simulate, write_trace
-from lae_sim.forecast.base import ForecasterFactory, Lanes, forecast, own
+from lae_sim.forecast.base import ForecasterFactory, Lanes, defines, forecast
 from lae_sim.learning.folds import Examples
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.learning.trainers import NetworkTrainer
-from lae_sim.report.table import table
+from lae_sim.report.table import aligned
 
 SEQUENCES, FRAMES = 123, 112_578
 ELAPSED_NS = 47_000_000
@@ -227,7 +227,7 @@ def forecaster_lines(rounds: int) -> list[list[str]]:
     together = {
         name: partial(forecast, factory, lanes, asked, frames + 3)
         for name, factory in factories.items()
-        if own(factory, "forecast_lanes")
+        if defines(factory, "forecast_lanes")
     }
     for name, work in together.items():
         taken = medians({name: work}, min(rounds, 3))[name] / len(asked) * count
@@ -320,7 +320,7 @@ def main() -> None:
         found = engine_lines(arguments.rounds) + forecaster_lines(arguments.rounds)
         found += process_lines(str(trace), arguments.rounds)
         found += memory_lines(folder, arguments.sequences)
-    print(table(["what", "how", "median", "ratio", "target"], found))
+    print(aligned(["what", "how", "median", "ratio", "target"], found))
 
 
 if __name__ == "__main__":

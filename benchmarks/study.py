@@ -31,7 +31,7 @@ from lae_sim.evaluation.evaluate import evaluate_groups
 from lae_sim.forecast.base import Hold
 from lae_sim.replay.latency import bootstrap
 from lae_sim.replay.run import replay_repeated
-from lae_sim.report.table import table
+from lae_sim.report.table import aligned
 
 RATES = (15, 20, 25, 30, 40, 50, 60, 90)  # frames/s of the trackers
 REPETITIONS = 81  # 9,963 lanes
@@ -256,7 +256,7 @@ def main() -> None:
         found += size_lines(folder, arguments.rounds, arguments.largest)
     found += lane_lines(arguments.rounds)
     head = ["what", "how", "median", "all cores", "MiB: worker, parent", "ratio", "target"]
-    print(table(head, found))
+    print(aligned(head, found))
     print(
         "\nPublished results have a mean fps, so constant times. Where times jitter around a "
         "multiple of\nthe frame interval, each sigma has a history of its own for kalman: up to 51 "

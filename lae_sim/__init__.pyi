@@ -33,8 +33,8 @@ from .replay.latency import (
 )
 from .replay.run import Run, replay_repeated, replay_sequence
 from .replay.world import SIGMA_GRID, World, replay_trace
+from .report.comparison import comparison_table
 from .report.film import Scene, draw_frame, film_strip
-from .report.forecasters import comparison_table
 from .report.page import write_report
 from .report.study_tables import write_tables
 from .study.run import StudyResults, run_study

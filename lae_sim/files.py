@@ -1,7 +1,8 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all; names and digests."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -76,6 +77,11 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def text_digest(text: str) -> str:
+    """The first 32 hexadecimal digits of a text's SHA-256, as a name of what it describes."""
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def labels(paths: Sequence[str]) -> list[str]:

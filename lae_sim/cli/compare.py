@@ -122,7 +122,7 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.out and Path(arguments.out).suffix not in (".csv", ".parquet"):
         raise LaeError(f"--out {arguments.out}: name a .csv or .parquet file")
     if arguments.plot:
-        from lae_sim.report.figures import check_format
+        from lae_sim.report.style import check_format
 
         check_format(arguments.plot)
     from lae_sim.engine.scheduler import scores_latency
@@ -196,7 +196,7 @@ def _tell(
 
     from lae_sim import __version__
     from lae_sim.comparison.statistics import by_attribute, over_sigmas, summarise
-    from lae_sim.report.forecasters import comparison_table
+    from lae_sim.report.comparison import comparison_table
 
     metrics, notes = ("auc", "dp20"), table.attrs["notes"]
     if arguments.sigma_grid:
@@ -205,8 +205,8 @@ def _tell(
     summary = summarise(table, **settings)
     divided = None if attributes is None else by_attribute(table, attributes, **settings)
     if arguments.plot:
-        from lae_sim.report.figures import save
         from lae_sim.report.forecaster_figures import overview
+        from lae_sim.report.style import save
 
         save(overview(summary, metrics[0]), arguments.plot)
     if arguments.sigma_grid:

@@ -3,42 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from lae_sim.cli.options import exit_status, new_parser
 
 PROGRAM = "lae-sim fidelity"
-
-SUMMARY_COLUMNS = {
-    "closed_loop": "closed loop",
-    "forecaster": "forecaster",
-    "replay": "replay",
-    "sequences": "sequences",
-    "closed_auc": "closed AUC",
-    "auc": "AUC",
-    "mean_abs_d_auc": "mean |d|",
-    "median_abs_d_auc": "median",
-    "max_abs_d_auc": "max",
-    "closed_dp20": "closed DP",
-    "dp20": "DP",
-    "mean_abs_d_dp20": "mean |d|",
-}
-SEQUENCE_COLUMNS = {
-    "closed_loop": "closed loop",
-    "forecaster": "forecaster",
-    "replay": "replay",
-    "sequence": "sequence",
-    "closed_auc": "closed AUC",
-    "auc": "AUC",
-    "d_auc": "d",
-    "closed_dp20": "closed DP",
-    "dp20": "DP",
-    "d_dp20": "d",
-    "parted": "parted at",
-    "disagreement": "disagree",
-}
 
 DESCRIPTION = """\
 Compare replays of a trace of every frame with closed loops, in which the tracker really skipped
@@ -88,35 +59,20 @@ def _fidelity(arguments: argparse.Namespace) -> None:
         forecasters=arguments.forecaster,
         convention=arguments.convention,
     )
-    summary = [asdict(each) for each in summarise_closed_loops(rows)]
-    sequences = [asdict(row) for row in rows]
+    summary = summarise_closed_loops(rows)
     if arguments.json:
         head = {"format": "lae-fidelity", "version": "1.0", "lae_sim": __version__}
         settings = {"trace": arguments.trace, "strided": arguments.strided}
         settings["convention"] = arguments.convention
-        document = {**head, **settings, "summary": summary, "sequences": sequences}
-        print(json.dumps(document, indent=2))
+        parts = {"summary": list(map(asdict, summary)), "sequences": list(map(asdict, rows))}
+        print(json.dumps({**head, **settings, **parts}, indent=2))
         return
+    from lae_sim.report.comparison import fidelity_table
+
     if arguments.per_sequence:
-        print(_table(sequences, SEQUENCE_COLUMNS, left=4), end="\n\n")
-    print(_table(summary, SUMMARY_COLUMNS, left=3), end="\n\n")
+        print(fidelity_table(rows), end="\n\n")
+    print(fidelity_table(summary), end="\n\n")
     print(
         f"AUC by convention {arguments.convention}; |d| is |replay - closed loop| of a sequence.\n"
         "every-frame: boxes of TRACE; strided: of the pass nearest to the frames skipped."
     )
-
-
-def _table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, str], left: int) -> str:
-    """Rows as aligned text."""
-    from lae_sim.report.table import table
-
-    lines = [[_text(row[key], key.startswith("d_")) for key in columns] for row in rows]
-    return table(list(columns.values()), lines, left=left)
-
-
-def _text(value: object, signed: bool) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, float):
-        return f"{value:+.3f}" if signed else f"{value:.3f}"
-    return str(value)

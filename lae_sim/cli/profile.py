@@ -221,16 +221,9 @@ def _profile(arguments: argparse.Namespace) -> int:
 def _print_summary(traces: Sequence[PassSummary]) -> None:
     import shlex
 
-    from lae_sim.report.table import table
+    from lae_sim.report.trace import profile_table
 
-    header = ["trace", "sequences", "frames", "processed", "lost", "init ms", "median ms", "p95 ms"]
-    lines = [
-        [each.trace]
-        + [f"{n:,}" for n in (each.sequences, each.world_frames, each.processed, each.lost)]
-        + ["-" if ms is None else f"{ms:.2f}" for ms in (each.init_ms, each.median_ms, each.p95_ms)]
-        for each in traces
-    ]
-    print(table(header, lines, left=1))
+    print(profile_table(traces))
     first, *others = traces
     kind = first.schedule["kind"]
     strided = [each for each in others if "stride" in each.schedule]

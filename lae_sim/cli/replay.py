@@ -145,7 +145,7 @@ def _replay(arguments: argparse.Namespace) -> None:
     named = zip(arguments.traces, labels(arguments.traces))
     jobs = [job for path, label in named for job in jobs_of(path, label, worlds, arguments)]
     if arguments.plot:
-        from lae_sim.report.figures import check_format
+        from lae_sim.report.style import check_format
 
         check_format(arguments.plot)
     with ExitStack() as files:  # whatever fails, no file is left behind
@@ -225,32 +225,33 @@ def _plot(
     """Draw success and precision of all traces, or how AUC and DP change over a sweep."""
     from pathlib import Path
 
+    from lae_sim.evaluation.evaluate import evaluate
     from lae_sim.evaluation.metrics import find_convention
-    from lae_sim.report import figures as plots
+    from lae_sim.report import figures
     from lae_sim.report.export import sigma_text
+    from lae_sim.report.style import save
 
     sigma, several = arguments.sigma[0], len(arguments.traces) > 1
     title = "" if several else f"{jobs[0].label}: "
     title += f"sigma {sigma_text(sigma)}, convention {jobs[0].world.convention}"
     if swept:
-        from lae_sim.report.figures import sweep_figure
-
         names = [job.label for job in jobs]
-        plots.save(sweep_figure(reports, names, float(sigma), swept, title), arguments.plot)
+        save(figures.sweep_figure(reports, names, float(sigma), swept, title), arguments.plot)
         return
-    named: plots.Curves = {}
+    named: figures.Curves = {}
     for job in jobs:
-        found = plots.curves(
+        evaluation = evaluate(
             job.runs,
             job.trace.metadata,
             job.forecasters,
-            sigma,
+            [sigma],
             find_convention(job.world.convention),
             job.costs,
         )
+        found = figures.mean_curves(evaluation, job.forecasters)
         prefix = f"{Path(job.label).with_suffix('')}: " if several else ""
         named.update({prefix + name: curve for name, curve in found.items()})
-    plots.save(plots.success_and_precision(named, title), arguments.plot)
+    save(figures.success_and_precision(named, title), arguments.plot)
 
 
 def _print_tables(

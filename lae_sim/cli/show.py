@@ -44,7 +44,7 @@ def _show(arguments: argparse.Namespace) -> None:
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="replace")  # a name may have what the terminal has not
     if arguments.plot:
-        from lae_sim.report.figures import check_format
+        from lae_sim.report.style import check_format
 
         check_distinct([arguments.plot], paths)
         check_format(arguments.plot)

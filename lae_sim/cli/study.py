@@ -101,7 +101,7 @@ def _study(arguments: argparse.Namespace) -> bool:
     if arguments.json:
         print(json.dumps(results.document(), indent=2, allow_nan=False))
     else:
-        from lae_sim.report.study_text import study_text
+        from lae_sim.report.study_tables import study_text
 
         print(study_text(results), end="\n\n")
         left = sorted(path.name for path in results.folder.glob("[!.]*"))

@@ -1,15 +1,17 @@
-"""Statistics of a comparison: intervals, paired differences and tests, over sequences.
+"""Statistics over sequences: resample, compare, correct, recover; and a comparison's summary.
 
-Sequences are the independent observations; frames are not. Everything is computed in groups, one
-per trace, latency, scale, sigma and metric. All forecasters of a group are measured on the same
-sequences, and share the bootstrap's resamples, so that their differences are paired. The tidy table
-that goes in is described at :func:`lae_sim.comparison.forecasters.compare_forecasters`.
+Sequences are the independent observations; frames are not. What is compared is measured on the same
+sequences and shares the bootstrap's resamples, so that differences are paired.
+
+:func:`summarise` does so in groups, one per trace, latency, scale, sigma and metric, of a tidy
+table (described at :func:`lae_sim.comparison.forecasters.compare_forecasters`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,15 +28,157 @@ Counts = npt.NDArray[np.unsignedinteger[Any]]
 ALL_TRACES = "all traces"
 ALL_SEQUENCES = "all sequences"
 KEYS = ["attribute", "trace", "latency", "scale", "sigma", "forecaster", "metric"]
+RESAMPLES = 10_000
 _ROWS = 200  # resamples at once
 _NOISE_DECIMALS = 12  # equal differences of scores in 0..1 are equal to this many decimals
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The ends of an interval."""
+
+    low: float
+    high: float
+
+    def columns(self, name: str) -> dict[str, float]:
+        """The ends by their keys in a row in which the value is ``name``."""
+        return {f"{name}_low": self.low, f"{name}_high": self.high}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A mean paired difference of scores over sequences.
+
+    Attributes:
+        value: the difference of the means.
+        interval: of it, bootstrapped.
+        p: of no difference (:func:`signed_rank_p`).
+        better, worse: numbers of sequences.
+    """
+
+    value: float
+    interval: Interval
+    p: float
+    better: int
+    worse: int
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """The share of the latency loss that a forecaster wins back.
+
+    Attributes:
+        share: of the means; None without a loss.
+        interval: of it, bootstrapped; None if there is a resample without a loss.
+    """
+
+    share: float | None
+    interval: Interval | None
+
+
+class Bootstrap:
+    """The percentile bootstrap over sequences.
+
+    Source: Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, Ch. 13. All that have
+    the same number of sequences share their resamples, which depend on the seed and that number
+    alone.
+
+    Args:
+        resamples: how many.
+        seed: of NumPy's PCG64.
+        tails: the quantiles that are the ends of an interval.
+    """
+
+    def __init__(
+        self,
+        resamples: int = RESAMPLES,
+        seed: int = 0,
+        tails: tuple[float, float] = (0.025, 0.975),
+    ) -> None:
+        self.resamples, self.seed, self.tails = resamples, seed, tails
+        self._counts: dict[int, Counts] = {}
+
+    def counts(self, count: int) -> Counts:
+        """How often each sequence is in each resample, uint16 [resamples, count] (or wider)."""
+        if count not in self._counts:
+            generator = np.random.Generator(np.random.PCG64(self.seed))
+            counts = np.empty((self.resamples, count), np.uint16 if count < 2**16 else np.uint32)
+            for row in range(0, self.resamples, _ROWS):  # the same stream, without a large array
+                some = counts[row : row + _ROWS]
+                some[:] = generator.multinomial(count, np.full(count, 1 / count), size=len(some))
+            self._counts[count] = counts
+        return self._counts[count]
+
+    def means(self, values: Floats) -> Floats:
+        """The mean of each row of values [F, S] in each resample, float64 [F, resamples]."""
+        # not a product by BLAS, where a row's last bits depend on the number of rows
+        counts = self.counts(values.shape[1])
+        blocks = [
+            np.einsum("fs,rs->fr", values, counts[row : row + _ROWS] / counts.shape[1])
+            for row in range(0, len(counts), _ROWS)
+        ]
+        return np.concatenate(blocks, axis=1)
+
+    def interval(self, samples: Floats) -> Interval:
+        """The range between the tails of samples."""
+        return Interval(*np.quantile(samples, self.tails).tolist())
+
+    def compare(
+        self, values: Floats, baseline: Floats | float, means: Floats, others: Floats | float
+    ) -> Difference:
+        """The paired difference of scores to a baseline's.
+
+        Args:
+            values, baseline: scores by sequence, float64 [S]; or differences, and 0.
+            means, others: their means in each resample, float64 [resamples].
+        """
+        differences = np.round(values - baseline, _NOISE_DECIMALS)
+        return Difference(
+            value=float(np.mean(values) - np.mean(baseline)),
+            interval=self.interval(means - others),
+            p=signed_rank_p(differences),
+            better=int((differences > 0).sum()),
+            worse=int((differences < 0).sum()),
+        )
+
+    def recover(self, won: float, lost: float, wins: Floats, losses: Floats) -> Recovered:
+        """The share of a loss that is won back.
+
+        Args:
+            won, lost: differences of the means (see :func:`recovered`).
+            wins, losses: the same in each resample, float64 [resamples].
+        """
+        shares = self.interval(wins / losses) if (losses > 0).all() else None
+        return Recovered(recovered(won, lost), shares)
+
+
+def recovered(won: float, lost: float) -> float | None:
+    """The share of the latency loss won back; None without a loss.
+
+    Args:
+        won: forecast - hold, of means or sums of scores over some sequences.
+        lost: offline - hold, over the same.
+    """
+    return won / lost if lost > 0 else None
+
+
+def holm(ps: Sequence[float]) -> list[float]:
+    """p-values corrected for their number, in their order.
+
+    Source: Holm, "A Simple Sequentially Rejective Multiple Test Procedure", 1979.
+    """
+    corrected, least = [0.0] * len(ps), 0.0
+    for rank, i in enumerate(sorted(range(len(ps)), key=ps.__getitem__)):
+        least = max(least, min(1.0, ps[i] * (len(ps) - rank)))
+        corrected[i] = least
+    return corrected
 
 
 def summarise(
     table: pd.DataFrame,
     baselines: Sequence[str] = ("hold", "kalman"),
     metrics: Sequence[str] = ("auc", "dp20"),
-    resamples: int = 10_000,
+    resamples: int = RESAMPLES,
     seed: int = 0,
     confidence: float = 0.95,
 ) -> pd.DataFrame:
@@ -49,10 +193,7 @@ def summarise(
         table: the tidy table; a column ``attribute`` divides the groups further.
         baselines: forecasters that the others are compared with, where the table has them.
         metrics: those to summarise.
-        resamples: of the percentile bootstrap (Efron and Tibshirani, "An Introduction to the
-            Bootstrap", 1993, Ch. 13). A group's depend on ``seed`` and its number of sequences
-            alone.
-        seed: of NumPy's PCG64.
+        resamples, seed: of the :class:`Bootstrap`.
         confidence: of the intervals, between 0 and 1.
 
     Returns:
@@ -78,22 +219,18 @@ def summarise(
         raise LaeError("a bootstrap needs resamples >= 1 and 0 < confidence < 1")
     baselines = [name for name in baselines if (table["forecaster"] == name).any()]
     wide, order = _wide(table, metrics)
-    counts: dict[int, Counts] = {}
+    bootstrap = Bootstrap(resamples, seed, ((1 - confidence) / 2, (1 + confidence) / 2))
     parts = []
     keys = [key for key in order if key != "forecaster"]
     for values, group in wide.groupby(keys, sort=False):
         present = [name for name in order["forecaster"] if group[name].notna().any()]
         group = group.dropna(subset=[name for name in present if name != "offline"])
         present = [name for name in present if group[name].notna().all()]
-        count = len(group)
-        if not count or not present:
+        if group.empty or not present:
             continue
-        if count not in counts:
-            counts[count] = bootstrap_counts(count, resamples, seed)
         scores = np.ascontiguousarray(group[present].to_numpy(np.float64).T)
-        columns = _compared(scores, present, counts[count], baselines, confidence)
-        columns = {"forecaster": present, "sequences": count, **columns}
-        parts.append(pd.DataFrame({**dict(zip(keys, values)), **columns}))
+        part = pd.DataFrame(_summary_rows(scores, present, baselines, bootstrap))
+        parts.append(part.assign(forecaster=present, **dict(zip(keys, values))))
     if not parts:
         raise LaeError("nothing to summarise: no sequence has a value for every forecaster")
     summary = pd.concat(parts)[[*order, *parts[0].columns.difference(list(order), sort=False)]]
@@ -132,7 +269,7 @@ def by_attribute(
 
 
 def over_sigmas(table: pd.DataFrame) -> pd.DataFrame:
-    """The tidy table of the plain means over its permitted latencies: metrics mauc, mdp20, ...
+    """The tidy table of the plain means over permitted latencies: metrics mauc, mdp20, ...
 
     Over 0, 0.02, ..., 1 these are mAUC and mDP of Li et al., "PVT++", 2023. ``sigma`` is 0 in all.
     """
@@ -167,66 +304,55 @@ def _wide(table: pd.DataFrame, metrics: Sequence[str]) -> tuple[pd.DataFrame, di
     return wide, order
 
 
-def bootstrap_counts(count: int, resamples: int, seed: int) -> Counts:
-    """How often each sequence is in each resample, uint16 [resamples, count] (or wider)."""
-    generator = np.random.Generator(np.random.PCG64(seed))
-    counts = np.empty((resamples, count), np.uint16 if count < 2**16 else np.uint32)
-    for row in range(0, resamples, _ROWS):  # the same stream, without a large array
-        some = counts[row : row + _ROWS]
-        some[:] = generator.multinomial(count, np.full(count, 1 / count), size=len(some))
-    return counts
+def _summary_rows(
+    scores: Floats, names: Sequence[str], baselines: Sequence[str], bootstrap: Bootstrap
+) -> list[dict[str, Any]]:
+    """The columns of one group from its scores [F, S], a row for each of its F forecasters."""
+    means = bootstrap.means(scores)
+    place = {name: f for f, name in enumerate(names)}
+    hold, offline = place.get("hold"), place.get("offline")
+    rows = []
+    for f in range(len(names)):
+        interval = bootstrap.interval(means[f])
+        row: dict[str, Any] = {
+            "sequences": scores.shape[1],
+            "mean": float(scores[f].mean()),
+            "low": interval.low,
+            "high": interval.high,
+        }
+        for baseline in baselines:
+            b = place.get(baseline)
+            row |= _difference_columns(
+                f"vs_{baseline}",
+                None if b is None else bootstrap.compare(scores[f], scores[b], means[f], means[b]),
+            )
+        share, ends = None, None
+        if hold is not None and offline is not None:
+            won, lost = (float(scores[i].mean() - scores[hold].mean()) for i in (f, offline))
+            recovery = bootstrap.recover(
+                won, lost, means[f] - means[hold], means[offline] - means[hold]
+            )
+            share, ends = recovery.share, recovery.interval
+        row["recovered"] = math.nan if share is None else share
+        row |= (ends or _UNKNOWN).columns("recovered")
+        rows.append(row)
+    return rows
 
 
-def resampled_means(values: Floats, counts: Counts) -> Floats:
-    """The mean of each row of values [F, S] in each resample, float64 [F, resamples]."""
-    # not a product by BLAS, where a row's last bits depend on the number of rows
-    blocks = [
-        np.einsum("fs,rs->fr", values, counts[row : row + _ROWS] / counts.shape[1])
-        for row in range(0, len(counts), _ROWS)
-    ]
-    return np.concatenate(blocks, axis=1)
+_UNKNOWN = Interval(math.nan, math.nan)
 
 
-def _compared(
-    scores: Floats,
-    names: Sequence[str],
-    counts: Counts,
-    baselines: Sequence[str],
-    confidence: float,
-) -> dict[str, Any]:
-    """The columns of one group from its scores [F, S], each of length F."""
-    columns: dict[str, Any] = {}
-    tails = [(1 - confidence) / 2, (1 + confidence) / 2]
-
-    def add(name: str, value: Floats, samples: Floats, prefix: str) -> None:
-        columns[name] = value
-        columns[f"{prefix}low"], columns[f"{prefix}high"] = np.quantile(samples, tails, axis=1)
-
-    mean = scores.mean(axis=1)
-    resampled = resampled_means(scores, counts)
-    unknown = np.full(len(names), np.nan)
-    add("mean", mean, resampled, "")
-    for baseline in baselines:
-        name = f"vs_{baseline}"
-        if baseline not in names:
-            columns |= dict.fromkeys([name, f"{name}_low", f"{name}_high", f"{name}_p"], unknown)
-            columns |= {f"{name}_better": 0, f"{name}_worse": 0}
-            continue
-        b = names.index(baseline)
-        differences = np.round(scores - scores[b], _NOISE_DECIMALS)
-        add(name, mean - mean[b], resampled - resampled[b], f"{name}_")
-        columns[f"{name}_p"] = [signed_rank_p(row) for row in differences]
-        columns[f"{name}_better"] = (differences > 0).sum(axis=1)
-        columns[f"{name}_worse"] = (differences < 0).sum(axis=1)
-    if {"hold", "offline"} <= set(names):
-        hold, offline = names.index("hold"), names.index("offline")
-        loss, losses = mean[offline] - mean[hold], resampled[offline] - resampled[hold]
-        share = (mean - mean[hold]) / (loss if loss > 0 else np.nan)
-        shares = (resampled - resampled[hold]) / np.where((losses > 0).all(), losses, np.nan)
-        add("recovered", share, shares, "recovered_")
-    else:
-        columns |= dict.fromkeys(["recovered", "recovered_low", "recovered_high"], unknown)
-    return columns
+def _difference_columns(name: str, difference: Difference | None) -> dict[str, float]:
+    """The columns of a difference to a baseline, NaN and 0 where there is no such baseline."""
+    if difference is None:
+        difference = Difference(math.nan, _UNKNOWN, math.nan, 0, 0)
+    return {
+        name: difference.value,
+        **difference.interval.columns(name),
+        f"{name}_p": difference.p,
+        f"{name}_better": difference.better,
+        f"{name}_worse": difference.worse,
+    }
 
 
 def signed_rank_p(differences: Floats) -> float:

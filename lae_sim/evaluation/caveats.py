@@ -8,7 +8,7 @@ import numpy as np
 
 from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import Convention
-from lae_sim.forecast.base import AnyFactory, own_notes
+from lae_sim.forecast.base import AnyFactory, notes_of
 from lae_sim.replay.run import Run
 from lae_sim.trace.describe import STALL
 from lae_sim.trace.metadata import Metadata
@@ -78,5 +78,5 @@ def notes_on(
             f"{unknown} of {len(sequences)} sequences"
         )
     for name, factory in forecasters.items():
-        notes += [f"{name}: {note}" for note in own_notes(factory, sequences)]
+        notes += [f"{name}: {note}" for note in notes_of(factory, sequences)]
     return notes

@@ -13,7 +13,7 @@ from lae_sim.errors import LaeError, explained
 from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scorer
-from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, forecast, own
+from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
@@ -289,7 +289,7 @@ def _answers(
             if isinstance(factory, SequenceFactory)
             else [factory] * len(runs)
         )
-    for fed in histories(pairing, memoryless=own(factory, "memoryless")).parts(_PART):
+    for fed in histories(pairing, memoryless=defines(factory, "memoryless")).parts(_PART):
         found = pairs(pairing, fed)
         lanes = lanes_of(runs, pairing, fed, image_sizes)
         shared = {id(its): its for its in factories}.values()

@@ -9,10 +9,23 @@ predicts the box at any later frame. Anything with these two methods will do:
         def predict(self, frame): return [x, y, w, h]
 
 The class itself is the factory; name it ``package.module:MyForecaster`` on the command line.
+
+That is the *streaming* form, and all that a forecaster needs: :func:`forecast` feeds it box after
+box. A factory may have a second form for many sequences and permitted latencies at once, its
+*lanes* (:class:`LaneFactory`). The built-in ones that have it keep it as the only form, or nearly:
+
+    hold                a stored box, and one `take` over lanes: nothing to share
+    constant-velocity   lanes; streaming is a lane of its last two outputs (:class:`LastOutputs`)
+    windows             lanes; streaming is a lane of as many outputs as the rule looks at
+    kalman              one update that works on one filter and on n of them in step
+    g-h, imm, oracle    streaming
+    camera+NAME         both: over lanes all frames are mapped at once, 25 times as fast, while
+                        streaming by a lane would ask for all outputs so far at every frame
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -45,6 +58,12 @@ ForecasterFactory = Callable[[Sequence[float], ImageSize], Forecaster]
 class Lanes:
     """The outputs that forecasters are fed, lane after lane; a lane is one forecaster's life.
 
+    Three lanes with N = 6 items, outputs of the frames 0, 2, 5 of one sequence and so on:
+
+        item      0  1  2 | 3 | 4  5
+        frames    0  2  5 | 0 | 0  3
+        offsets   0         3   4      6
+
     Attributes:
         offsets: first item of each lane, and N: int64 [lanes + 1]. A lane's first item is the
             initial box at frame 0.
@@ -60,8 +79,8 @@ class Lanes:
 
     def lane(self, item: Ints) -> Ints:
         """The lane of each item, int64 [P]."""
-        found: Ints = np.searchsorted(self.offsets, item, "right") - 1
-        return found
+        lane: Ints = np.searchsorted(self.offsets, item, "right") - 1
+        return lane
 
     def first(self, item: Ints) -> Ints:
         """The first item of each item's lane, int64 [P]."""
@@ -72,7 +91,7 @@ class Lanes:
         """Some of the lanes, by a mark for each: bool [lanes].
 
         Returns:
-            The lanes, which of some items [P] are theirs, bool [P], and those items' places there.
+            The lanes, which of some items [P] are in them, bool [P], and those items' places there.
         """
         sizes = np.diff(self.offsets)
         kept = np.repeat(lanes, sizes)
@@ -82,8 +101,8 @@ class Lanes:
             self.boxes[kept],
             self.image_sizes[lanes],
         )
-        theirs = kept[item]
-        return part, theirs, (np.cumsum(kept) - 1)[item[theirs]]
+        inside = kept[item]
+        return part, inside, (np.cumsum(kept) - 1)[item[inside]]
 
 
 @runtime_checkable
@@ -133,7 +152,7 @@ def factory_for(factory: AnyFactory, sequence: Sequenced) -> ForecasterFactory:
     return factory.for_sequence(sequence) if isinstance(factory, SequenceFactory) else factory
 
 
-def own_notes(factory: Any, sequences: Sequence[str]) -> list[str]:
+def notes_of(factory: Any, sequences: Sequence[str]) -> list[str]:
     """What a factory has to say of its forecasts of some sequences."""
     return factory.notes(sequences) if isinstance(factory, NotedFactory) else []
 
@@ -161,28 +180,44 @@ class Hold:
         return boxes
 
 
-class ConstantVelocity:
-    """The latest box moved on by the difference of the last two."""
+class LastOutputs:
+    """The streaming form of a forecaster over lanes that looks at the last few outputs only.
 
-    def __init__(self, box: Sequence[float], image_size: ImageSize = None) -> None:
-        self._frame = 0
-        self._box = [float(value) for value in box]
-        self._velocity = [0.0] * 4
+    They are a lane by themselves, of which the factory is asked.
+    """
+
+    def __init__(self, factory: LaneFactory, count: int, box: Sequence[float]) -> None:
+        self._factory = factory
+        self._outputs = deque([(0, tuple(box))], maxlen=count)
 
     def update(self, frame: int, box: Sequence[float]) -> None:
         """Take in the box of a newer frame."""
-        interval = float(frame - self._frame)
-        self._velocity = [(new - old) / interval for new, old in zip(box, self._box)]
-        self._frame, self._box = frame, [float(value) for value in box]
+        self._outputs.append((frame, tuple(box)))
 
     def predict(self, frame: int) -> Sequence[float]:
-        """The box at a frame, from the last two boxes."""
-        interval = float(frame - self._frame)
-        return [p + interval * v for p, v in zip(self._box, self._velocity)]
+        """The box at a frame, from the last boxes."""
+        frames, boxes = zip(*self._outputs)
+        count = len(frames)
+        lane = Lanes(
+            np.array([0, count]),
+            np.array(frames, np.int64),
+            np.array(boxes, np.float64),
+            np.full((1, 2), np.inf),
+        )
+        forecasts = self._factory.forecast_lanes(lane, np.array([count - 1]), np.array([frame]))
+        box: list[float] = forecasts[0].tolist()
+        return box
+
+
+class ConstantVelocity(LastOutputs):
+    """The latest box moved on by the difference of the last two."""
+
+    def __init__(self, box: Sequence[float], image_size: ImageSize = None) -> None:
+        super().__init__(ConstantVelocity, 2, box)
 
     @staticmethod
     def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
-        """The same for many lanes at once; equal bit for bit."""
+        """Forecasts of many lanes at once."""
         before = np.maximum(item - 1, lanes.first(item))
         interval = np.maximum(lanes.frames[item] - lanes.frames[before], 1).astype(np.float64)
         velocity = (lanes.boxes[item] - lanes.boxes[before]) / interval[:, None]
@@ -197,10 +232,10 @@ class Oracle:
     @staticmethod
     def for_sequence(sequence: Sequenced) -> ForecasterFactory:
         """The factory that answers with this sequence's truth."""
-        return partial(_Told, sequence.truth)
+        return partial(_Truth, sequence.truth)
 
 
-class _Told(Hold):
+class _Truth(Hold):
     def __init__(self, truth: Floats, box: Sequence[float], image_size: ImageSize = None) -> None:
         super().__init__(box)
         self._truth = truth
@@ -210,8 +245,8 @@ class _Told(Hold):
         return truth if truth[2] > 0 and truth[3] > 0 else super().predict(frame)
 
 
-def own(factory: AnyFactory, name: str) -> bool:
-    """Whether a factory's class itself has an attribute.
+def defines(factory: AnyFactory, name: str) -> bool:
+    """Whether a factory's class itself defines an attribute.
 
     What it inherits does not count: a subclass may have changed the methods that a shortcut of its
     base stands for.
@@ -238,14 +273,14 @@ def forecast(
         LaeError: if a forecaster fails, or answers anything but four finite numbers.
     """
     with explained(name):
-        if own(factory, "forecast_lanes") and isinstance(factory, LaneFactory):
+        if defines(factory, "forecast_lanes") and isinstance(factory, LaneFactory):
             boxes = np.asarray(factory.forecast_lanes(lanes, item, frame), np.float64)
             if boxes.shape != (len(item), 4):
                 raise LaeError(f"{name}: answered {boxes.shape}, not {(len(item), 4)}")
             good = np.isfinite(boxes).all(axis=1)
             if not good.all():
-                told, at = boxes[~good][0], frame[~good][0]
-                raise LaeError(f"{name}: predicted {told} for frame {at}, not a box x, y, w, h")
+                box, at = boxes[~good][0], frame[~good][0]
+                raise LaeError(f"{name}: predicted {box} for frame {at}, not a box x, y, w, h")
             return boxes
         return _streamed(factory, lanes, item, frame, name)
 
@@ -254,26 +289,26 @@ def _streamed(
     factory: ForecasterFactory, lanes: Lanes, item: Ints, frame: Ints, name: str
 ) -> Floats:
     """The forecasts of forecasters that are fed one box after another."""
-    answers = np.empty((len(item), 4))
+    boxes = np.empty((len(item), 4))
     fed, current = -1, -1
     forecaster: Any = None
     for p, (i, k) in enumerate(zip(item.tolist(), lanes.lane(item).tolist())):
         if k != current:
             current, fed = k, int(lanes.offsets[k])
             size = lanes.image_sizes[k]
-            known = (int(size[0]), int(size[1])) if np.isfinite(size).all() else None
-            forecaster = factory(lanes.boxes[fed].tolist(), known)
+            image_size = (int(size[0]), int(size[1])) if np.isfinite(size).all() else None
+            forecaster = factory(lanes.boxes[fed].tolist(), image_size)
         while fed < i:
             fed += 1
             forecaster.update(int(lanes.frames[fed]), lanes.boxes[fed].tolist())
-        told = forecaster.predict(int(frame[p]))
+        answer = forecaster.predict(int(frame[p]))
         try:
-            answer = np.asarray(told, np.float64)
+            box = np.asarray(answer, np.float64)
         except (TypeError, ValueError, OverflowError):
-            answer = np.array(np.nan)
-        if answer.shape != (4,) or not np.isfinite(answer).all():
+            box = np.array(np.nan)
+        if box.shape != (4,) or not np.isfinite(box).all():
             raise LaeError(
-                f"{name}: predicted {told!r:.80} for frame {frame[p]}, not a box x, y, w, h"
+                f"{name}: predicted {answer!r:.80} for frame {frame[p]}, not a box x, y, w, h"
             )
-        answers[p] = answer
-    return answers
+        boxes[p] = box
+    return boxes

@@ -36,7 +36,7 @@ from lae_sim.forecast.base import (
     Sequenced,
     factory_for,
     forecast,
-    own_notes,
+    notes_of,
 )
 
 LONGER_SIDE = 320  # of the images that are looked at, pixels; 480 costs twice and gains nothing
@@ -80,7 +80,7 @@ def estimate_camera(
 
     Args:
         sequence: the frames.
-        progress: told how many more frames are done, after each.
+        progress: called with how many more frames are done, after each.
 
     Raises:
         LaeError: if a frame cannot be read.
@@ -101,9 +101,9 @@ def estimate_camera(
             if scale < 1:
                 grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             if before is not None and before.shape == grey.shape:
-                found = _similarity(before, grey)
-                if found is not None:
-                    transforms[frame] = _enlarged(found, scale)
+                similarity = _similarity(before, grey)
+                if similarity is not None:
+                    transforms[frame] = _enlarged(similarity, scale)
             before = grey
             elapsed_ns[frame] = perf_counter_ns() - start
             progress(1)
@@ -113,7 +113,7 @@ def estimate_camera(
 
 
 def _similarity(before: Any, now: Any) -> Floats | None:
-    """The similarity from one grey image to the next, float64 [2, 3]; None if it cannot be told."""
+    """The similarity from one grey image to the next, float64 [2, 3]; None if it is unknown."""
     import cv2
 
     corners = cv2.goodFeaturesToTrack(before, CORNERS, qualityLevel=0.01, minDistance=8)
@@ -125,13 +125,13 @@ def _similarity(before: Any, now: Any) -> Floats | None:
     good = closed & (followed[:, 0] == 1) & (returned[:, 0] == 1)
     if good.sum() < LEAST_INLIERS:
         return None
-    found, inliers = cv2.estimateAffinePartial2D(  # its RANSAC seeds itself, always the same
+    similarity, inliers = cv2.estimateAffinePartial2D(  # RANSAC seeds itself, always the same
         corners[good], there[good], method=cv2.RANSAC, ransacReprojThreshold=1.0
     )
-    if found is None or inliers.sum() < max(LEAST_INLIERS, LEAST_SHARE * good.sum()):
+    if similarity is None or inliers.sum() < max(LEAST_INLIERS, LEAST_SHARE * good.sum()):
         return None
-    plausible = SCALES[0] <= math.hypot(found[0, 0], found[1, 0]) <= SCALES[1]
-    return np.asarray(found, np.float64) if plausible else None
+    plausible = SCALES[0] <= math.hypot(similarity[0, 0], similarity[1, 0]) <= SCALES[1]
+    return np.asarray(similarity, np.float64) if plausible else None
 
 
 def _enlarged(transform: Floats, scale: float) -> Floats:
@@ -179,15 +179,15 @@ class Camera:
         """
         name = sequence.name
         if name not in self.known:
-            own = sequence if isinstance(sequence, ImageSequence) else None
-            images = self.sequences.get(name, own)
+            live = sequence if isinstance(sequence, ImageSequence) else None
+            images = self.sequences.get(name, live)
             if images is None:
                 raise LaeError(f"sequence {name!r}: the camera's motion needs its frames")
             self.known[name] = estimate_camera(images)
         transforms = self.known[name].transforms
-        here, seen = len(sequence.truth), len(transforms)
-        if here != seen:
-            raise LaeError(f"sequence {name!r} has {here} frames here, and {seen} images")
+        frames, images_seen = len(sequence.truth), len(transforms)
+        if frames != images_seen:
+            raise LaeError(f"sequence {name!r} has {frames} frames here, and {images_seen} images")
         return _outlooks(transforms, self.lag_of(name))
 
 
@@ -201,7 +201,7 @@ class CameraCompensated:
     itself; so both are run, and the closest of the two answers (see :class:`Closest`).
 
     Attributes:
-        base: the forecaster of the target's motion. It is told no image size, since what it sees
+        base: the forecaster of the target's motion. It is given no image size, since what it sees
             is not the image.
         camera: the camera's motion.
         always: whether the camera's motion counts even where it lately did not help.
@@ -227,7 +227,7 @@ class CameraCompensated:
         lags = sorted({self.camera.lag_of(n) for n in sequences if n in self.camera.known})
         why = "by what estimating takes on this machine" if self.camera.lag is None else "as told"
         late = f"the camera's motion is late by {' or '.join(map(str, lags))} frames, {why}"
-        return [late] * bool(lags) + own_notes(self.base, sequences)
+        return [late] * bool(lags) + notes_of(self.base, sequences)
 
 
 def _outlooks(transforms: Floats, lag: int) -> Complexes:
@@ -288,6 +288,8 @@ class _Moving:
 
 
 class _OnMoving:
+    """The streaming form, by the same maps for one box."""
+
     def __init__(self, factory: _Moving, box: Sequence[float]) -> None:
         self._factory = factory
         self._base = factory.base(self._stilled(0, box), None)
@@ -298,13 +300,15 @@ class _OnMoving:
         self._latest = frame
 
     def predict(self, frame: int) -> Sequence[float]:
-        told = np.array([self._base.predict(frame)], np.float64)
-        moved = self._factory.moved(told, np.array([self._latest]), np.array([frame]))
-        return moved[0].tolist()  # type: ignore[no-any-return]
+        still = np.array([self._base.predict(frame)], np.float64)
+        moved = self._factory.moved(still, np.array([self._latest]), np.array([frame]))
+        box: list[float] = moved[0].tolist()
+        return box
 
     def _stilled(self, frame: int, box: Sequence[float]) -> list[float]:
-        still = self._factory.stilled(np.array([box], np.float64), np.array([frame]))
-        return still[0].tolist()  # type: ignore[no-any-return]
+        boxes = self._factory.stilled(np.array([box], np.float64), np.array([frame]))
+        still: list[float] = boxes[0].tolist()
+        return still
 
 
 RECENT = 10
@@ -312,10 +316,13 @@ RECENT = 10
 
 @dataclass(frozen=True, eq=False)
 class Closest:
-    """A factory of several forecasters run side by side.
+    """A factory of several forecasters run side by side: the one that lately missed least answers.
+
+    An error is the distance of the centres of a prediction, made before an output came, and the
+    output; the sum of the last ten counts.
 
     Attributes:
-        several: their factories. The first one answers until outputs tell them apart.
+        several: their factories. The first one answers while none is better.
     """
 
     several: tuple[ForecasterFactory, ...]
@@ -329,24 +336,26 @@ class Closest:
         fed = np.setdiff1d(np.arange(len(lanes.frames)), lanes.offsets[:-1])
         first, errors, boxes = lanes.first(item), [], []
         for factory in self.several:
-            missed = np.zeros(len(lanes.frames))
-            foretold = forecast(factory, lanes, fed - 1, lanes.frames[fed])
-            missed[fed] = _distance(foretold, lanes.boxes[fed])
+            error = np.zeros(len(lanes.frames))  # stays 0 at a lane's first item
+            predicted = forecast(factory, lanes, fed - 1, lanes.frames[fed])
+            error[fed] = _distance(predicted, lanes.boxes[fed])
             recent = item[:, None] - np.arange(RECENT)
-            errors.append(missed[np.maximum(recent, first[:, None])].sum(axis=1))
+            errors.append(error[np.maximum(recent, first[:, None])].sum(axis=1))
             boxes.append(forecast(factory, lanes, item, frame))
-        answers: Floats = np.stack(boxes)[np.argmin(errors, axis=0), np.arange(len(item))]
-        return answers
+        closest: Floats = np.stack(boxes)[np.argmin(errors, axis=0), np.arange(len(item))]
+        return closest
 
 
 class _Several:
+    """The streaming form; its base forecasters may have no other."""
+
     def __init__(self, several: Sequence[Forecaster]) -> None:
         self._several = several
         self._errors: deque[Floats] = deque(maxlen=RECENT)
 
     def update(self, frame: int, box: Sequence[float]) -> None:
-        foretold = np.array([each.predict(frame) for each in self._several], np.float64)
-        self._errors.append(_distance(foretold, np.array([box], np.float64)))
+        predicted = np.array([each.predict(frame) for each in self._several], np.float64)
+        self._errors.append(_distance(predicted, np.array([box], np.float64)))
         for each in self._several:
             each.update(frame, box)
 

@@ -38,18 +38,18 @@ def measure_cost(factory: AnyFactory, recording: Recording, name: str = "forecas
 
 def cost_notes(costs: Mapping[str, int]) -> list[str]:
     """What to say of the costs that were counted, if there were any."""
-    told = ", ".join(f"{name} {ns / 1000:g} us" for name, ns in costs.items())
-    return [f"answers come later by what forecasting costs: {told}"] if costs else []
+    listed = ", ".join(f"{name} {ns / 1000:g} us" for name, ns in costs.items())
+    return [f"answers come later by what forecasting costs: {listed}"] if costs else []
 
 
 def resolve_costs(
-    told: Sequence[str], forecasters: Mapping[str, AnyFactory], trace: Iterable[Recording]
+    texts: Sequence[str], forecasters: Mapping[str, AnyFactory], trace: Iterable[Recording]
 ) -> dict[str, int]:
-    """The cost of each forecaster's answers, ns; those not told of cost nothing.
+    """The cost of each forecaster's answers, ns; those not named cost nothing.
 
     Args:
-        told: ``COST`` for every forecaster but hold, or ``NAME=COST`` for one; the last one counts.
-            A cost is a time such as ``2ms``, or ``measured``.
+        texts: ``COST`` for every forecaster but hold, or ``NAME=COST`` for one; the last counts. A
+            cost is a time such as ``2ms``, or ``measured``.
         forecasters: factories by name.
         trace: they are measured on its first recording.
 
@@ -57,7 +57,7 @@ def resolve_costs(
         LaeError: if a text is none of these, or names another forecaster.
     """
     costs: dict[str, int | None] = {}
-    for text in told:
+    for text in texts:
         name, _, cost = text.rpartition("=")
         if name and name not in forecasters:
             raise LaeError(f"the cost {text!r}: there is no forecaster {name!r} here")

@@ -15,7 +15,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from lae_sim._arrays import Floats, Ints
+from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou
 from lae_sim.errors import LaeError
 from lae_sim.forecast.base import ImageSize, Lanes
@@ -25,7 +25,6 @@ LEAST_AREA = 75
 _CHUNK = 1 << 14  # forecasts at once: what is made of them stays in the cache
 
 Number = TypeVar("Number", float, Floats)
-Covariance = tuple[Number, Number, Number]
 
 
 @dataclass(frozen=True)
@@ -70,12 +69,12 @@ class TunedKalman:
         self, lanes: Lanes, item: Ints, frame: Ints, restart_iou: float | None = None
     ) -> Floats:
         """The same for many lanes at once; restarts as in :func:`filter_lanes`."""
-        states, place = _filtered(lanes, self, restart_iou)
+        states, place = filter_lanes(lanes, self, restart_iou)
         forecasts = np.empty((4, len(item)))
         for begin in range(0, len(item), _CHUNK):
             now = slice(begin, begin + _CHUNK)
-            found = states.take(place.take(item[now]), axis=0)
-            position, velocity = np.ascontiguousarray(found.transpose(1, 2, 0))
+            latest = states.take(place.take(item[now]), axis=0)
+            position, velocity = np.ascontiguousarray(latest.transpose(1, 2, 0))
             ahead = frame[now] - lanes.frames.take(item[now])
             velocity *= self.reach(ahead.astype(np.float64))
             np.add(position, velocity, out=forecasts[:, now])
@@ -91,26 +90,6 @@ class TunedKalman:
     def transition(self, interval: Number) -> tuple[Number, Number, Number]:
         """What is left of the velocity after an interval, its reach, and the process noise."""
         return self.decay**interval, self.reach(interval), self.q * (interval * interval)
-
-    def gain(
-        self, covariance: Covariance[Number], keep: Number, reach: Number, noise: Number
-    ) -> tuple[Covariance[Number], Number, Number]:
-        """Predict the covariance over an interval and update it with a measurement.
-
-        Args:
-            covariance: of a position with itself, with its velocity, and of the velocity.
-            keep, reach, noise: the :meth:`transition` over the interval.
-
-        Returns:
-            The new covariance, and the gains of position and velocity (Eqs. 7-9).
-        """
-        a, b, c = covariance
-        a = a + 2.0 * reach * b + reach * reach * c + noise
-        b = keep * (b + reach * c)
-        c = keep * keep * c + noise
-        position = a / (a + self.r)
-        velocity = b / (a + self.r)
-        return (a - position * a, b - position * b, c - velocity * b), position, velocity
 
     def states(self, boxes: Floats) -> Floats:
         """Boxes as positions of the filter's state, float64 [n, 4]."""
@@ -132,6 +111,76 @@ class TunedKalman:
 PAPER = TunedKalman()
 
 
+class _Filter:
+    """The state of one filter, or of n filters that take in their outputs in step.
+
+                     one filter   n filters
+        states       [2, 4]       [2, 4, n]   positions; velocities
+        covariances  [3]          [3, n]      a; b; c of [[a I, b I], [b I, c I]]
+
+    The arithmetic is along the last axes, so the same lines serve both: this is the only place
+    where the filter's equations stand.
+    """
+
+    def __init__(self, settings: TunedKalman, position: Floats) -> None:
+        self._settings = settings
+        self._initial = np.array([[settings.p0], [0.0], [settings.p0]])
+        self.states = np.empty((2, *position.shape))
+        self._covariances = np.empty((3, *position.shape[1:]))
+        self._restart(np.ones(position.shape[1:], np.bool_), position)
+
+    def _restart(self, which: Bools, position: Floats) -> None:
+        self.states[0][..., which] = position[..., which]
+        self.states[1][..., which] = 0.0
+        self._covariances[..., which] = self._initial
+
+    def keep_first(self, n: int) -> None:
+        """Go on with the first n filters only, in memory of their own."""
+        self.states = self.states[:, :, :n].copy()
+        self._covariances = self._covariances[:, :n].copy()
+
+    def update(
+        self,
+        transition: tuple[Number, Number, Number],
+        measured: Floats,
+        restart_iou: float | None = None,
+    ) -> None:
+        """Predict over an interval and update with a measurement (Eqs. 6-9).
+
+        Args:
+            transition: :meth:`TunedKalman.transition` over the interval of each filter.
+            measured: positions, float64 [4] or [4, n].
+            restart_iou: a measurement that overlaps its prediction by less restarts the filter.
+        """
+        keep, reach, noise = transition
+        position, velocity = self.states  # views: what is done in place is done to the states
+        a, b, c = self._covariances  # views where there are n, which saves memory; else numbers
+        a += 2.0 * reach * b
+        a += reach * reach * c
+        a += noise
+        b += reach * c
+        position += reach * velocity
+        if self._settings.decay != 1:
+            b *= keep
+            c *= keep * keep
+            velocity *= keep
+        c += noise
+        innovation_variance = a + self._settings.r
+        position_gain, velocity_gain = a / innovation_variance, b / innovation_variance
+        self._covariances[2] = c - velocity_gain * b
+        self._covariances[1] = b - position_gain * b
+        self._covariances[0] = a - position_gain * a
+        if restart_iou is not None:
+            overlap = iou(position.reshape(4, -1).T, measured.reshape(4, -1).T)
+            lost = (overlap < restart_iou).reshape(position.shape[1:])
+        innovation = measured - position
+        position += position_gain * innovation
+        innovation *= velocity_gain
+        velocity += innovation
+        if restart_iou is not None and lost.any():
+            self._restart(lost, measured)
+
+
 class Kalman:
     """The paper's filter, exactly; or another of its family."""
 
@@ -140,46 +189,32 @@ class Kalman:
         box: Sequence[float],
         image_size: ImageSize = None,
         settings: TunedKalman = PAPER,
+        restart_iou: float | None = None,
     ) -> None:
         self._settings = settings
-        self._restart(0, box)
+        self._restart_iou = restart_iou
+        self._frame = 0
+        self._filter = _Filter(settings, self._position(box))
 
-    def _restart(self, frame: int, box: Sequence[float]) -> None:
-        self._frame = frame
-        self._position = self._measured(box)
-        self._velocity = [0.0] * 4
-        self._covariance = self._settings.p0, 0.0, self._settings.p0
-
-    def _measured(self, box: Sequence[float]) -> list[float]:
-        if self._settings.state == "corner":
-            return [float(value) for value in box]
-        state: list[float] = self._settings.states(np.array([box], np.float64))[0].tolist()
-        return state
-
-    def _extrapolate(self, frame: int) -> list[float]:
-        reach = self._settings.reach(float(frame - self._frame))
-        return [p + reach * v for p, v in zip(self._position, self._velocity)]
+    def _position(self, box: Sequence[float]) -> Floats:
+        position: Floats = self._settings.states(np.array([box], np.float64))[0]
+        return position
 
     def update(self, frame: int, box: Sequence[float]) -> None:
         """Take in the box of a newer frame."""
-        interval = float(frame - self._frame)
-        predicted = self._extrapolate(frame)
-        kept, reach, noise = self._settings.transition(interval)
-        self._covariance, position, velocity = self._settings.gain(
-            self._covariance, kept, reach, noise
-        )
-        errors = [measured - p for measured, p in zip(self._measured(box), predicted)]
-        self._position = [p + position * error for p, error in zip(predicted, errors)]
-        self._velocity = [kept * v + velocity * e for v, e in zip(self._velocity, errors)]
+        transition = self._settings.transition(float(frame - self._frame))
+        self._filter.update(transition, self._position(box), self._restart_iou)
         self._frame = frame
 
     def predict(self, frame: int) -> Sequence[float]:
         """The box at a frame, from the boxes so far."""
-        predicted = self._extrapolate(frame)
-        if self._settings.state == "corner":
-            return predicted
-        box: list[float] = self._settings.boxes(np.array([predicted]))[0].tolist()
+        box: list[float] = self._forecast(frame)[0].tolist()
         return box
+
+    def _forecast(self, frame: int) -> Floats:
+        position, velocity = self._filter.states
+        forecast = position + self._settings.reach(float(frame - self._frame)) * velocity
+        return self._settings.boxes(forecast[None])
 
     @staticmethod
     def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
@@ -197,24 +232,19 @@ class KalmanLaePvt(Kalman):
     """
 
     def __init__(self, box: Sequence[float], image_size: ImageSize = None) -> None:
-        super().__init__(box)
-        self._raw = self._position
+        super().__init__(box, restart_iou=RESTART_IOU)
+        self._raw = np.array([box], np.float64)
         self._size = np.array([image_size or (np.inf, np.inf)], np.float64)
 
     def update(self, frame: int, box: Sequence[float]) -> None:
         """Take in the box of a newer frame."""
-        self._raw = [float(value) for value in box]
-        predicted = np.array([self._extrapolate(frame)])
-        if iou(predicted, np.array([self._raw]))[0] < RESTART_IOU:
-            self._restart(frame, self._raw)
-        else:
-            super().update(frame, box)
+        self._raw = np.array([box], np.float64)
+        super().update(frame, box)
 
     def predict(self, frame: int) -> Sequence[float]:
         """The box at a frame, from the boxes so far."""
-        forecast = np.array([self._extrapolate(frame)])
-        answer: list[float] = clip(forecast, np.array([self._raw]), self._size)[0].tolist()
-        return answer
+        box: list[float] = clip(self._forecast(frame), self._raw, self._size)[0].tolist()
+        return box
 
     @staticmethod
     def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
@@ -244,41 +274,26 @@ def clip(forecasts: Floats, raw: Floats, image_sizes: Floats) -> Floats:
 
 
 def filter_lanes(
-    lanes: Lanes,
-    item: Ints,
-    settings: TunedKalman = PAPER,
-    restart_iou: float | None = None,
-) -> tuple[Floats, Floats]:
-    """Filter all lanes.
+    lanes: Lanes, settings: TunedKalman = PAPER, restart_iou: float | None = None
+) -> tuple[Floats, Ints]:
+    """Filter all lanes in step: the k-th output of every lane that has one, for each k.
+
+    So that each step works on one stretch of memory, lanes are sorted by length and items by their
+    place in the lane. Three lanes of 4, 3 and 1 outputs:
+
+        lane       in time-major order
+        a0 a1 a2 a3     a0 b0 c0 | a1 b1 | a2 b2 | a3
+        b0 b1 b2        running = 3, 2, 2, 1; ends = 3, 5, 7, 8
+        c0
 
     Args:
         lanes: what the filters are fed.
-        item: the items asked about, int64 [P].
         settings: the filter.
         restart_iou: a measurement that overlaps its prediction by less restarts the filter there.
 
     Returns:
-        Position and velocity of the state after each of these items, float64 [4, P] each.
-    """
-    states, place = _filtered(lanes, settings, restart_iou)
-    position, velocity = states.take(place.take(item), axis=0).transpose(1, 2, 0)
-    return position, velocity
-
-
-def _filtered(
-    lanes: Lanes, settings: TunedKalman, restart_iou: float | None
-) -> tuple[Floats, Ints]:
-    """Filter all lanes in step: the k-th update of every lane that has one, for each k.
-
-    Lanes are sorted by length, so that those still running are always the first ones, and items by
-    their place in the lane, so that each step works on one stretch of memory.
-
-    The arithmetic is that of :meth:`TunedKalman.gain`, in place: the fewer arrays are touched, the
-    faster.
-
-    Returns:
-        States after all items, position and velocity, float64 [2, 4, N], and where each item has
-        its own, int64 [N].
+        Position and velocity after each item in time-major order, float64 [N, 2, 4], and the place
+        of each item there, int64 [N].
     """
     lengths = np.diff(lanes.offsets)
     longest = np.argsort(-lengths, kind="stable")
@@ -294,44 +309,15 @@ def _filtered(
     measured = np.ascontiguousarray(settings.states(lanes.boxes).take(order, axis=0).T)
     states = np.empty((len(order), 2, 4))
     width = int(running[0])
-    state = np.zeros((2, 4, width))
-    state[0] = measured[:, :width]
-    states[:width] = state.transpose(2, 0, 1)
-    start = np.array([[settings.p0], [0.0], [settings.p0]])
-    covariance = np.repeat(start, width, axis=1)
+    filters = _Filter(settings, measured[:, :width])
+    states[:width] = filters.states.transpose(2, 0, 1)
     for n, end in zip(running[1:].tolist(), ends[1:].tolist()):
         now = slice(end - n, end)
         if n < width:
-            width, state, covariance = n, state[:, :, :n].copy(), covariance[:, :n].copy()
-        (position, velocity), (a, b, c) = state, covariance
-        kept, reached, noisy = keep[now], reach[now], noise[now]
-        term = 2.0 * reached
-        term *= b
-        a += term
-        np.multiply(reached, reached, out=term)
-        term *= c
-        a += term
-        a += noisy
-        np.multiply(reached, c, out=term)
-        b += term
-        if settings.decay != 1:
-            b *= kept
-            c *= kept * kept
-        c += noisy
-        gains = covariance[:2] / np.add(a, settings.r, out=term)
-        c -= np.multiply(gains[1], b, out=term)
-        covariance[:2] -= gains[0] * covariance[:2]
-        position += reached * velocity
-        if settings.decay != 1:
-            velocity *= kept
-        measured_now = measured[:, now]
-        if restart_iou is not None:
-            lost = np.flatnonzero(iou(position.T, measured_now.T) < restart_iou)
-        state += gains[:, None] * (measured_now - position)
-        if restart_iou is not None:
-            position[:, lost], velocity[:, lost] = measured_now[:, lost], 0.0
-            covariance[:, lost] = start
-        states[now] = state.transpose(2, 0, 1)
+            width = n
+            filters.keep_first(n)
+        filters.update((keep[now], reach[now], noise[now]), measured[:, now], restart_iou)
+        states[now] = filters.states.transpose(2, 0, 1)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     return states, place

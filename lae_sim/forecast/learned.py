@@ -5,7 +5,7 @@ of width and height, with the intervals between them and the frames to look ahea
 weights for these velocities and a correction. It starts as a mean of the last three velocities, is
 mirrored in x and y so that no direction is preferred, and predicts at any horizon. A regression on
 past motion is PVT++'s idea (Li et al., "PVT++: A Simple End-to-End Latency-Aware Visual Tracking
-Framework", ICCV 2023, Sec. 4); weights over velocities, and training on the overlap, are ours.
+Framework", ICCV 2023, Sec. 4); weights over velocities, and training on the overlap, are new here.
 """
 
 from __future__ import annotations
@@ -140,12 +140,12 @@ class Inputs:
             torch.log(self.ahead[:, None] + 0.5),
             self.shape,
         ]
-        told = network(torch.cat(context, 1))
+        output = network(torch.cat(context, 1))
         n = VELOCITIES
-        weights = told[:, : 2 * n].reshape(-1, 2, n) * known[:, None]
+        weights = output[:, : 2 * n].reshape(-1, 2, n) * known[:, None]
         centre = (weights[:, 0, :, None] * self.velocities[..., :2]).sum(1)
         sides = (weights[:, 1, :, None] * self.velocities[..., 2:]).sum(1)
-        correction = _CORRECTION * known[:, :1] * told[:, 2 * n :]
+        correction = _CORRECTION * known[:, :1] * output[:, 2 * n :]
         return (torch.cat([centre, sides], 1) + correction) * self.ahead[:, None]
 
 

@@ -1,22 +1,28 @@
-"""Forecasters that look at the last few outputs only, one sequence or many at a time."""
+"""Forecasters that look at the last few outputs only."""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.errors import LaeError
-from lae_sim.forecast.base import ImageSize, Lanes, own_notes
+from lae_sim.forecast.base import Forecaster, ImageSize, Lanes, LastOutputs, notes_of
 
 
 @dataclass(frozen=True)
 class Window:
     """The last n outputs before each of P forecasts, the newest first.
+
+    A lane with outputs of the frames 0, 2, 5, asked as of each of them, n = 3:
+
+        frames     known
+        0  0  0    yes no  no
+        2  0  0    yes yes no
+        5  2  0    yes yes yes
 
     Attributes:
         frames: frame of each, int64 [P, n].
@@ -63,9 +69,9 @@ class Windowed(Generic[AnyRule]):
 
     rule: AnyRule
 
-    def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> _Recent:
+    def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Forecaster:
         """The forecaster of one sequence."""
-        return _Recent(self, box)
+        return LastOutputs(self, self.rule.size, box)
 
     def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
         """The same for many lanes at once; equal but for rounding."""
@@ -78,33 +84,7 @@ class Windowed(Generic[AnyRule]):
 
     def notes(self, sequences: Sequence[str]) -> list[str]:
         """What the rule has to say."""
-        return own_notes(self.rule, sequences)
-
-
-class _Recent:
-    """A forecaster that keeps the last outputs and applies the rule to them."""
-
-    def __init__(self, factory: Windowed[Any], box: Sequence[float]) -> None:
-        self._factory = factory
-        self._outputs = deque([(0, box)], maxlen=factory.rule.size)
-
-    def update(self, frame: int, box: Sequence[float]) -> None:
-        """Take in the box of a newer frame."""
-        self._outputs.append((frame, box))
-
-    def predict(self, frame: int) -> Sequence[float]:
-        """The box at a frame, from the last boxes."""
-        frames, boxes = zip(*self._outputs)
-        count = len(frames)
-        lane = Lanes(
-            np.array([0, count]),
-            np.array(frames, np.int64),
-            np.array(boxes, np.float64),
-            np.full((1, 2), np.inf),
-        )
-        item, asked = np.array([count - 1]), np.array([frame])
-        answer: list[float] = self._factory.forecast_lanes(lane, item, asked)[0].tolist()
-        return answer
+        return notes_of(self.rule, sequences)
 
 
 _ROUNDS = 4

@@ -21,7 +21,7 @@ from lae_sim.forecast.base import (
     Lanes,
     Sequenced,
     factory_for,
-    own_notes,
+    notes_of,
 )
 from lae_sim.replay.run import Run
 from lae_sim.replay.world import World
@@ -38,7 +38,7 @@ class Examples:
         item: the latest item known at each query, int64 [P], not decreasing.
         frame: the world frame of each query, int64 [P].
         truth: its ground truth, float64 [P, 4]; NaN where there is none.
-        boxes: the box that the tracker itself found there offline, float64 [P, 4]; NaN where the
+        boxes: the tracker's box of that frame in the trace, offline, float64 [P, 4]; NaN where the
             trace has none.
     """
 
@@ -54,15 +54,15 @@ class Examples:
         """The examples of some runs of one trace."""
         pairing = pair([run.schedule for run in runs], [Fraction(0)])
         fed = histories(pairing)
-        found = pairs(pairing, fed)
+        queries = pairs(pairing, fed)
         lanes = lanes_of(runs, pairing, fed, np.full((len(runs), 2), np.inf))
         ends = np.cumsum(pairing.lengths)
-        row = (ends - pairing.lengths)[lanes.lane(found.item)] + found.frame
+        row = (ends - pairing.lengths)[lanes.lane(queries.item)] + queries.frame
         return cls(
             tuple(run.recording.name for run in runs),
             lanes,
-            found.item,
-            found.frame,
+            queries.item,
+            queries.frame,
             np.concatenate([run.recording.truth for run in runs])[row],
             np.concatenate([run.recording.boxes for run in runs])[row],
         )
@@ -117,7 +117,7 @@ class Examples:
         kept = np.array([name not in sequences for name in self.sequences])
         lanes, asked, item = self.lanes.chosen(kept, self.item)
         return Examples(
-            tuple(name for name, its in zip(self.sequences, kept) if its),
+            tuple(name for name, keep in zip(self.sequences, kept) if keep),
             lanes,
             item,
             *(getattr(self, name)[asked] for name in ("frame", "truth", "boxes")),
@@ -166,7 +166,7 @@ class CrossFitted:
         notes: dict[str, None] = {}
         for fold, factory in enumerate(self.factories):
             scored = [name for name in sequences if self.folds[name] == fold]
-            notes.update(dict.fromkeys(own_notes(factory, scored)))
+            notes.update(dict.fromkeys(notes_of(factory, scored)))
         return list(notes)
 
 
@@ -189,7 +189,7 @@ def cross_fitted(
     factories = []
     for fold in range(max(folds.values()) + 1):
         progress()
-        held_out = {name for name, its in folds.items() if its == fold}
+        held_out = {name for name, assigned in folds.items() if assigned == fold}
         factories.append(trainer.fit(examples.without(held_out), seed))
     return CrossFitted(folds, tuple(factories))
 

@@ -11,9 +11,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou
 from lae_sim.errors import LaeError
-from lae_sim.forecast.base import (
-    ForecasterFactory,
-)
+from lae_sim.forecast.base import ForecasterFactory
 from lae_sim.forecast.camera import Camera, CameraCompensated
 from lae_sim.forecast.kalman import PAPER
 from lae_sim.forecast.learned import (
@@ -32,10 +30,10 @@ from lae_sim.learning.folds import Examples, Trainer
 class NetworkTrainer:
     """Trains a network by gradient descent on the overlap with what came.
 
-    Half of the loss is 1 - IoU with the truth and half with the box that the tracker itself found
-    later (Yu et al., "UnitBox", 2016, minimise -ln IoU); a small term in the distance of the
-    centres draws boxes that do not overlap. AdamW (Loshchilov and Hutter, 2019) with the one-cycle
-    rate (Smith and Topin, 2019).
+    Half of the loss is 1 - IoU with the truth and half with the tracker's own box of that frame (Yu
+    et al., "UnitBox", 2016, minimise -ln IoU); a small term in the distance of the centres draws
+    boxes that do not overlap. AdamW (Loshchilov and Hutter, 2019) with the one-cycle rate (Smith
+    and Topin, 2019).
 
     Attributes:
         steps: steps of gradient descent.
@@ -44,7 +42,7 @@ class NetworkTrainer:
         faster: motion is made faster or slower by a random factor; the standard deviation of its
             logarithm. It is mirrored, too, and x and y change places, since motion that is not in
             the traces may come as well.
-        progress: told after each step how many more are done.
+        progress: called after each step with how many more are done.
     """
 
     steps: int = 1000
@@ -113,14 +111,14 @@ def _sized(boxes: Floats) -> Bools:
 
 
 def _goals(latest: Floats, examples: Examples, which: Ints) -> Any:
-    """Truth and the tracker's own later box as changes from the latest one, float32 [P, 2, 4].
+    """Truth and the tracker's later box as changes from the latest one, float32 [P, 2, 4].
 
     Where one of them is missing the other stands for both.
     """
-    truth, own = examples.truth[which], examples.boxes[which]
-    truth = np.where(_sized(truth)[:, None], truth, own)
-    own = np.where(_sized(own)[:, None], own, truth)
-    goals = np.stack([truth, own], axis=1)
+    truth, boxes = examples.truth[which], examples.boxes[which]
+    truth = np.where(_sized(truth)[:, None], truth, boxes)
+    boxes = np.where(_sized(boxes)[:, None], boxes, truth)
+    goals = np.stack([truth, boxes], axis=1)
     sides, scale = sides_and_size(latest[:, None])
     centre = goals[..., :2] + goals[..., 2:] / 2 - latest[:, None, :2] - latest[:, None, 2:] / 2
     logs = np.log(goals[..., 2:] / sides)
@@ -134,13 +132,13 @@ def _loss(change: Any, goals: Any) -> Any:
 
     offset = goals[..., :2] - change[:, None, :2]
     aspect = goals[..., 4:]
-    ours = torch.exp(change[:, None, 2:].clamp(-1, 1) + aspect)  # sides, in target sizes
-    theirs = torch.exp(goals[..., 2:4] + aspect)
-    shared = (torch.minimum(ours / 2, offset + theirs / 2)).sub(
-        torch.maximum(-ours / 2, offset - theirs / 2)
+    sides = torch.exp(change[:, None, 2:].clamp(-1, 1) + aspect)  # in target sizes
+    goal_sides = torch.exp(goals[..., 2:4] + aspect)
+    shared = (torch.minimum(sides / 2, offset + goal_sides / 2)).sub(
+        torch.maximum(-sides / 2, offset - goal_sides / 2)
     )
     overlap = shared.clamp(min=0).prod(2)
-    union = ours.prod(2) + theirs.prod(2) - overlap
+    union = sides.prod(2) + goal_sides.prod(2) - overlap
     distance = torch.sqrt(offset.pow(2).sum(2) + 0.01).clamp(max=2)
     return (1 - overlap / union + 0.1 * distance).mean(1)
 
@@ -150,8 +148,8 @@ class KalmanTrainer:
     """Chooses q, decay and state of a :class:`TunedKalman` for the highest mean IoU with the truth.
 
     One parameter after another takes its best value, until none changes; r and p0 stay the paper's,
-    since the gains rest on
-    ratios alone, q / r and p0 / r, of which the second fades after few outputs.
+    since the gains rest
+    on ratios alone, q / r and p0 / r, of which the second fades after few outputs.
 
     Attributes:
         q, decay, state: the values to choose from.

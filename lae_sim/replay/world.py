@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import product
-from typing import Any, TypeAlias, TypeVar, get_args
+from typing import Any, TypeAlias, TypeVar
 
 from lae_sim.engine import policies
 from lae_sim.engine.clock import Clock, Number, exact, parse_fps, whole
@@ -113,8 +113,8 @@ class World:
             passes=several(passes),
             sigmas=named("sigma", parse_sigmas, sigma),
             convention=convention,
-            forecasters=tuple(dict.fromkeys(_names(forecasters))),
-            costs=_names(costs),
+            forecasters=tuple(dict.fromkeys(several(forecasters))),
+            costs=several(costs),
         )
 
     @classmethod
@@ -295,8 +295,7 @@ def parse_sigmas(value: Number | Iterable[Number]) -> tuple[Fraction, ...]:
     """
     if isinstance(value, str) and value == "grid":
         return SIGMA_GRID
-    values = value if isinstance(value, Iterable) and not isinstance(value, str) else [value]
-    return tuple(sorted({exact(each) for each in values}))
+    return tuple(sorted({exact(each) for each in several(value)}))
 
 
 def check_sigmas(sigmas: tuple[Fraction, ...]) -> None:
@@ -309,20 +308,12 @@ def check_sigmas(sigmas: tuple[Fraction, ...]) -> None:
         raise LaeError("sigma: permitted latencies must be ascending, each of them once")
 
 
-def several(value: Value | Iterable[Value]) -> tuple[Value, ...]:
-    """One value, or several, as a tuple; nothing is none. A text or a trace is one value."""
+def several(value: Any) -> tuple[Any, ...]:
+    """One value, or several, as a tuple; None is none. Text, a trace, a function are one value."""
     if value is None:
         return ()
-    if isinstance(value, (*_ONE, Trace)) or callable(value):
-        return (value,)  # type: ignore[return-value]
-    return tuple(value)  # type: ignore[arg-type]
-
-
-_ONE = (str, os.PathLike, *get_args(Number))
-
-
-def _names(value: str | Iterable[str]) -> tuple[str, ...]:
-    return (value,) if isinstance(value, str) else tuple(value)
+    one = isinstance(value, (str, os.PathLike, Trace)) or not isinstance(value, Iterable)
+    return (value,) if one else tuple(value)
 
 
 def named(name: str, parse: Callable[[Any], Value], value: Any) -> Value:

@@ -1,24 +1,33 @@
-"""Pictures of a replay: success and precision, and the timeline of a sequence."""
+"""Pictures of replays: success and precision, sweeps, and the timeline of a sequence."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lae_sim._arrays import Floats
-from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import evaluate
-from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS, PYSOT, Convention
+from lae_sim.evaluation.evaluate import Evaluation
+from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS
 from lae_sim.evaluation.pairing import pair
-from lae_sim.files import written_whole
-from lae_sim.forecast.base import AnyFactory
 from lae_sim.replay.run import Run
 from lae_sim.report.replay import Report
-from lae_sim.trace.metadata import Metadata
+from lae_sim.report.style import (
+    BLUE,
+    VERMILION,
+    Style,
+    forecaster_lines,
+    forecaster_styles,
+    legend_below,
+    new_figure,
+    panel_grid,
+    styled,
+    tracker_styles,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,19 +38,17 @@ Curves = dict[str, tuple[Floats, Floats]]
 """By name: success over IoU thresholds, and precision over 0..50 px, mean over sequences."""
 
 
-def curves(
-    runs: Iterable[Run],
-    metadata: Metadata,
-    forecasters: Mapping[str, AnyFactory],
-    sigma: Fraction = Fraction(0),
-    convention: Convention = PYSOT,
-    costs: Mapping[str, int] | None = None,
-) -> Curves:
-    """Curves of the offline boxes, where the trace holds every frame, and of each forecaster."""
-    found = evaluate(runs, metadata, forecasters, [sigma], convention, costs)
-    named = dict(zip(forecasters, zip(found.success, found.precision)))
-    if not found.missing.any():
-        named = {"offline": (found.offline_success, found.offline_precision), **named}
+def mean_curves(evaluation: Evaluation, forecasters: Iterable[str]) -> Curves:
+    """Curves of the offline boxes, where the trace holds every frame, and of each forecaster.
+
+    Args:
+        evaluation: whose curves are those of its first permitted latency.
+        forecasters: names of its forecasters.
+    """
+    named = dict(zip(forecasters, zip(evaluation.success, evaluation.precision)))
+    if not evaluation.missing.any():
+        offline = evaluation.offline_success, evaluation.offline_precision
+        named = {"offline": offline, **named}
     return {
         name: (_mean(success), _mean(precision)) for name, (success, precision) in named.items()
     }
@@ -54,128 +61,137 @@ def _mean(curves: Floats) -> Floats:
     return mean
 
 
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A line of success and precision plots.
+
+    Attributes:
+        label: in the legend, which adds AUC and DP at 20 px.
+        success: over the IoU thresholds, float64 [N].
+        precision: over 0, 1, ..., 50 px, float64 [51].
+        style: of the line.
+    """
+
+    label: str
+    success: Floats
+    precision: Floats
+    style: Style
+
+
+@styled
+def draw_curves(curves: Sequence[Curve], title: str = "") -> Figure:
+    """Success and precision plots side by side."""
+    figure = new_figure(10, 4.2 + 0.1 * len(curves))
+    left, right = figure.subplots(1, 2)
+    figure.suptitle(title)
+    for curve in curves:
+        style = {**curve.style, "marker": ""}
+        label = f"{curve.label} [{curve.success.mean():.3f}, {curve.precision[20]:.3f}]"
+        left.plot(np.linspace(0, 1, len(curve.success)), curve.success, label=label, **style)
+        right.plot(CENTRE_THRESHOLDS, curve.precision, label=label, **style)
+    left.set(xlabel="overlap threshold", ylabel="success", xlim=(0, 1), ylim=(0, 1))
+    right.set(xlabel="centre error threshold (px)", ylabel="precision", xlim=(0, 50), ylim=(0, 1))
+    legend_below(figure)
+    return figure
+
+
 def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Figure:
-    """Success and precision plots side by side, AUC and DP at 20 px in the legends.
+    """Success and precision plots side by side, AUC and DP at 20 px in the legend.
 
     Args:
         named: curves by name; for several traces the names are ``"trace: forecaster"``.
         title: above both plots.
     """
-    figure = new_figure(10, 4.2)
-    left, right = figure.subplots(1, 2)
-    figure.suptitle(title)
-    traces = list(dict.fromkeys(name.rpartition(": ")[0] for name in named))
-    kinds = list(dict.fromkeys(name.rpartition(": ")[2] for name in named))
-    for name, (success, precision) in named.items():
-        trace, kind = traces.index(name.rpartition(": ")[0]), kinds.index(name.rpartition(": ")[2])
-        colour, style = f"C{trace if len(traces) > 1 else kind}", _style(kinds, kind, len(traces))
-        overlap = np.linspace(0, 1, len(success))
-        auc, dp = f"{name} [{success.mean():.3f}]", f"{name} [{precision[20]:.3f}]"
-        left.plot(overlap, success, color=colour, linestyle=style, label=auc)
-        right.plot(CENTRE_THRESHOLDS, precision, color=colour, linestyle=style, label=dp)
-    left.set(xlabel="overlap threshold", ylabel="success", xlim=(0, 1), ylim=(0, 1))
-    right.set(xlabel="centre error threshold (px)", ylabel="precision", xlim=(0, 50), ylim=(0, 1))
-    if len(named) <= 6:
-        left.legend(title="AUC", loc="lower left")
-        right.legend(title="at 20 px", loc="lower right")
-    else:
-        left.legend(title="AUC", loc="upper center", bbox_to_anchor=(0.5, -0.12))
-        right.legend(title="at 20 px", loc="upper center", bbox_to_anchor=(0.5, -0.12))
-        figure.set_size_inches(10, 4.6 + 0.22 * len(named))
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-    return figure
+    parts = {name: name.rpartition(": ")[::2] for name in named}
+    traces = tracker_styles(trace for trace, _ in parts.values())
+    forecasters = dict.fromkeys(forecaster for _, forecaster in parts.values())
+    styles, lines = forecaster_styles(forecasters), forecaster_lines(forecasters)
+    return draw_curves(
+        [
+            Curve(
+                name,
+                *named[name],
+                {**traces[trace], "linestyle": lines[forecaster]}
+                if len(traces) > 1
+                else styles[forecaster],
+            )
+            for name, (trace, forecaster) in parts.items()
+        ],
+        title,
+    )
 
 
-def _style(kinds: list[str], kind: int, traces: int) -> str:
-    """Dashes for offline; for several traces, whose colour tells them apart, one per forecaster."""
-    if kinds[kind] == "offline":
-        return "--"
-    others = [name for name in kinds if name != "offline"]
-    return ("-", ":", "-.")[others.index(kinds[kind]) % 3] if traces > 1 else "-"
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A line of a sweep.
+
+    Attributes:
+        label: in the legend.
+        x, y: its points, [n].
+        style: of the line; its markers are left out where there are many points.
+        band: around it, lowest and highest y, [n] each.
+    """
+
+    label: str
+    x: npt.ArrayLike
+    y: npt.ArrayLike
+    style: Style
+    band: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
 
 
-def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int = 20) -> Figure:
-    """When frames arrived and were processed or skipped, and which output answered each query.
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A panel of a sweep.
+
+    Attributes:
+        title, xlabel, ylabel: what it shows.
+        lines: on it.
+        logarithmic: whether the horizontal axis is, to the base of 2.
+    """
+
+    title: str
+    xlabel: str
+    ylabel: str
+    lines: Sequence[Line]
+    logarithmic: bool = False
+
+
+@styled
+def draw_sweep(
+    panels: Sequence[Panel], columns: int, title: str = "", names: Sequence[str] = (), **shared: Any
+) -> Figure:
+    """Lines over what was varied, a legend for all panels below them.
 
     Args:
-        run: one replayed sequence.
-        sigma: permitted latency of the queries, frames.
-        first: first world frame shown.
-        count: number of world frames shown.
+        panels: row by row.
+        columns: panels in a row.
+        title: above all.
+        names: labels in the order of the legend; by default in that of the lines.
+        shared: which axes panels share, as for Matplotlib's ``subplots``.
     """
-    schedule = run.schedule
-    clock = schedule.clock
-    frame_ms = clock.milliseconds(1)
-    end = min(first + count, schedule.length)
-    figure = new_figure(12, 3.6)
-    axes = figure.subplots()
-    processed = set(schedule.frames.tolist())
-    for frame in range(first, end):
-        taken = frame in processed
-        colour = "tab:blue" if taken else "tab:red"
-        axes.plot(frame * frame_ms, 2, "o", color=colour, fillstyle="full" if taken else "none")
-        axes.annotate(str(frame), (frame * frame_ms, 2.18), ha="center", fontsize=7)
-    ticks_per_ms = clock.ticks_per_ns * 1e6
-    for frame, start, ready in zip(schedule.frames, schedule.start, schedule.ready):
-        if ready >= first * clock.frame_ticks and frame < end:
-            begin, length = start / ticks_per_ms, (ready - start) / ticks_per_ms
-            axes.barh(1, length, left=begin, height=0.42, color="tab:blue", edgecolor="white")
-            if begin + length / 2 < (end + 0.5) * frame_ms:
-                axes.text(begin + length / 2, 1, str(frame), ha="center", va="center", color="w")
-    _draw_queries(axes, run, sigma, first, end)
-    axes.set_yticks(
-        [2, 1, 0], ["world frame\n(hollow: skipped)", "tracker busy", "query and source"]
-    )
-    axes.set(ylim=(-0.6, 2.5), xlabel="time (ms)", title=f"{run.recording.name}: who answers what")
-    axes.set_xlim((first - 0.5) * frame_ms, (end + 0.5) * frame_ms)
+    figure, grid = panel_grid(len(panels), columns, 10 / min(columns, 3), 3, **shared)
+    figure.suptitle(title)
+    for place, (axes, panel) in enumerate(zip(grid, panels)):
+        for line in panel.lines:
+            style = {**line.style, "marker": ""} if np.size(line.x) > MOST_MARKERS else line.style
+            axes.plot(line.x, line.y, label=line.label, **style)
+            if line.band is not None:
+                colour = line.style["color"]
+                axes.fill_between(line.x, *line.band, color=colour, alpha=0.12, linewidth=0)
+        axes.set(title=panel.title, ylabel=panel.ylabel)
+        if not shared.get("sharex") or place + columns >= len(panels):
+            axes.set_xlabel(panel.xlabel)
+        if panel.logarithmic:
+            axes.set_xscale("log", base=2)
+        xs = np.unique(np.concatenate([np.ravel(line.x) for line in panel.lines]))
+        if len(xs) <= MOST_TICKS:
+            axes.set_xticks(xs, [f"{x:g}" for x in xs], minor=False)
+    legend_below(figure, names)
     return figure
 
 
-def _draw_queries(axes: Axes, run: Run, sigma: Fraction, first: int, end: int) -> None:
-    """A mark for each query, joined to the moment when the output that answers it was ready."""
-    schedule = run.schedule
-    clock = schedule.clock
-    pairing = pair([schedule], [sigma])
-    spans = zip(schedule.frames, schedule.ready, pairing.first[:, 0], pairing.end[:, 0])
-    for source, ready, begin, stop in spans:
-        for frame in range(max(begin, first), min(stop, end)):
-            query = clock.milliseconds(frame + sigma)
-            axes.plot(query, 0, "|", color="black", markersize=12)
-            axes.annotate(f"{source}", (query, -0.4), ha="center", fontsize=7)
-            if source:
-                axes.plot(
-                    [ready / clock.ticks_per_ns / 1e6, query], [0.78, 0.12], lw=0.6, color="grey"
-                )
-
-
-def check_format(path: str) -> None:
-    """Check that a picture can be drawn to a file of this name.
-
-    Raises:
-        LaeError: if its ending is not known.
-    """
-    if Path(path).suffix[1:].lower() not in new_figure(1, 1).canvas.get_supported_filetypes():
-        raise LaeError(f"cannot draw to {path}: name a .png, .svg or .pdf file")
-
-
-def save(figure: Figure, path: str) -> None:
-    """Write a figure to a file whose ending says the format.
-
-    Raises:
-        LaeError: if it cannot be written, or the ending is not known.
-    """
-    check_format(path)
-    with written_whole(path) as temporary:
-        figure.savefig(temporary, format=Path(path).suffix[1:].lower(), dpi=150)
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure, of its own: pyplot would keep a list of all."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
+MOST_MARKERS, MOST_TICKS = 12, 8
+"""More points have no markers, and not each a tick."""
 
 _AXES = {"fps": "world frame rate (fps)", "latency_scale": "scale of the processing times"}
 _SCORES = {"auc": "AUC", "dp20": "DP at 20 px"}
@@ -204,32 +220,78 @@ def sweep_figure(
         row = [label] if len(set(labels)) > 1 else []
         row += [f"times x {report[name]}" for name in others]
         rows.setdefault(", ".join(row), []).append(report)
-    figure = new_figure(10, 0.8 + 3.4 * len(rows))
-    figure.suptitle(title)
-    panels = figure.subplots(len(rows), 2, squeeze=False, sharex=True, sharey="col")
-    for axes_of_row, (row_name, members) in zip(panels, rows.items()):
+    panels = []
+    for row_name, members in rows.items():
         members.sort(key=lambda report: Fraction(report[x]))
         places = [float(Fraction(report[x])) for report in members]
-        for axes, (metric, name) in zip(axes_of_row, _SCORES.items()):
-            lines: dict[str, list[float]] = {}
+        for metric, name in _SCORES.items():
+            scores: dict[str, list[float | None]] = {}
             for report in members:
                 for result in report["results"]:
                     if result["sigma"] == sigma:
-                        lines.setdefault(result["forecaster"], []).append(_known(result[metric]))
-            for forecaster, values in lines.items():
-                axes.plot(places, values, "o-", label=forecaster)
+                        scores.setdefault(result["forecaster"], []).append(result[metric])
             if members[0]["offline"] is not None:
-                axes.axhline(members[0]["offline"][metric], color="0.4", ls="--", label="offline")
-            axes.set(ylabel=name, title=row_name)
-            axes.grid(alpha=0.3)
-    for axes in panels[-1]:
-        axes.set_xlabel(_AXES[x])
-    legend = {}
-    for axes in panels[:, 0]:
-        legend.update(dict(zip(*reversed(axes.get_legend_handles_labels()))))
-    figure.legend(legend.values(), legend, loc="outside lower center", ncols=min(len(legend), 5))
+                scores["offline"] = [members[0]["offline"][metric]] * len(places)
+            styles = forecaster_styles(scores)
+            lines = [
+                Line(forecaster, places, np.array(values, np.float64), styles[forecaster])
+                for forecaster, values in scores.items()
+            ]
+            logarithmic = x == "latency_scale" and places[0] > 0
+            panels.append(Panel(row_name, _AXES[x], name, lines, logarithmic))
+    return draw_sweep(panels, 2, title, sharex=True, sharey="col")
+
+
+@styled
+def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int = 20) -> Figure:
+    """When frames arrived and were processed or skipped, and which output answered each query.
+
+    Args:
+        run: one replayed sequence.
+        sigma: permitted latency of the queries, frames.
+        first: first world frame shown.
+        count: number of world frames shown.
+    """
+    schedule = run.schedule
+    clock = schedule.clock
+    frame_ms = clock.milliseconds(1)
+    end = min(first + count, schedule.length)
+    figure = new_figure(12, 3.6)
+    axes = figure.subplots()
+    processed = set(schedule.frames.tolist())
+    for frame in range(first, end):
+        taken = frame in processed
+        colour = BLUE if taken else VERMILION
+        axes.plot(frame * frame_ms, 2, "o", color=colour, fillstyle="full" if taken else "none")
+        axes.annotate(str(frame), (frame * frame_ms, 2.18), ha="center", fontsize=7)
+    ticks_per_ms = clock.ticks_per_ns * 1e6
+    for frame, start, ready in zip(schedule.frames, schedule.start, schedule.ready):
+        if ready >= first * clock.frame_ticks and frame < end:
+            begin, length = start / ticks_per_ms, (ready - start) / ticks_per_ms
+            axes.barh(1, length, left=begin, height=0.42, color=BLUE, edgecolor="white")
+            if begin + length / 2 < (end + 0.5) * frame_ms:
+                axes.text(begin + length / 2, 1, str(frame), ha="center", va="center", color="w")
+    _draw_queries(axes, run, sigma, first, end)
+    axes.set_yticks(
+        [2, 1, 0], ["world frame\n(hollow: skipped)", "tracker busy", "query and source"]
+    )
+    axes.set(ylim=(-0.6, 2.5), xlabel="time (ms)", title=f"{run.recording.name}: who answers what")
+    axes.set_xlim((first - 0.5) * frame_ms, (end + 0.5) * frame_ms)
     return figure
 
 
-def _known(score: float | None) -> float:
-    return float("nan") if score is None else score
+def _draw_queries(axes: Axes, run: Run, sigma: Fraction, first: int, end: int) -> None:
+    """A mark for each query, joined to the moment when the output that answers it was ready."""
+    schedule = run.schedule
+    clock = schedule.clock
+    pairing = pair([schedule], [sigma])
+    spans = zip(schedule.frames, schedule.ready, pairing.first[:, 0], pairing.end[:, 0])
+    for source, ready, begin, stop in spans:
+        for frame in range(max(begin, first), min(stop, end)):
+            query = clock.milliseconds(frame + sigma)
+            axes.plot(query, 0, "|", color="black", markersize=12)
+            axes.annotate(f"{source}", (query, -0.4), ha="center", fontsize=7)
+            if source:
+                axes.plot(
+                    [ready / clock.ticks_per_ns / 1e6, query], [0.78, 0.12], lw=0.6, color="grey"
+                )

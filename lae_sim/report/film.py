@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +14,7 @@ from lae_sim._arrays import Floats
 from lae_sim.boxes import iou
 from lae_sim.datasets.frames import Image
 from lae_sim.errors import LaeError
+from lae_sim.report.style import forecaster_colours
 
 if TYPE_CHECKING:
     from lae_sim.datasets.frames import Image, ImageSequence
@@ -23,17 +24,17 @@ if TYPE_CHECKING:
     from lae_sim.trace.metadata import Metadata
 
 WHITE, DARK = (255, 255, 255), (24, 24, 24)
-COLOURS = (
-    (0, 159, 230),  # orange
-    (233, 180, 86),  # sky blue
-    (66, 228, 240),  # yellow
-    (115, 158, 0),  # bluish green
-    (167, 121, 204),  # reddish purple
-    (0, 94, 213),  # vermilion
-)
-"""Blue, green, red; the colours of Okabe and Ito, "Color Universal Design" (2008)."""
-
 Colour = tuple[int, int, int]
+"""Blue, green, red."""
+
+
+def colours_of(names: Iterable[str]) -> dict[str, Colour]:
+    """The colour of each forecaster, as in all figures."""
+    found = {}
+    for name, colour in forecaster_colours(names).items():
+        red, green, blue = bytes.fromhex(colour[1:])
+        found[name] = (blue, green, red)
+    return found
 
 
 def draw_frame(
@@ -45,7 +46,7 @@ def draw_frame(
 ) -> Image:
     """Draw boxes on a copy of a frame, and what they are below it.
 
-    The truth is white; the others have `COLOURS` in their order, and their IoU with the truth.
+    The truth is white; forecasters have their colours, and their IoU with the truth.
 
     Args:
         image: uint8 [H, W, 3].
@@ -63,8 +64,9 @@ def draw_frame(
     picture = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
     line = max(width // 320, 1)
     shown = [] if truth is None else [("truth", _row(truth), WHITE)]
-    for number, (name, box) in enumerate(boxes.items()):
-        shown.append((name + _overlap(truth, box), _row(box), COLOURS[number % len(COLOURS)]))
+    colours = colours_of(boxes)
+    for name, box in boxes.items():
+        shown.append((name + _overlap(truth, box), _row(box), colours[name]))
     for _, row, colour in shown:
         if np.isfinite(row).all():
             corners = np.concatenate([row[:, :2], row[:, :2] + row[:, 2:]]) * scale

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from lae_sim.comparison.statistics import ALL_TRACES
-from lae_sim.report.figures import new_figure
+from lae_sim.report.figures import Line, Panel, draw_sweep
+from lae_sim.report.style import (
+    Style,
+    forecaster_styles,
+    legend_below,
+    new_figure,
+    panel_grid,
+    styled,
+)
 from lae_sim.report.table import METRIC_LABELS, setting_label
 
 if TYPE_CHECKING:
@@ -17,12 +25,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST_TRACES = 6
-_MARKERS = "osD^v<>pPX"
 _RECOVERED_LIMITS = (-100, 150)  # where little was lost, an interval knows no bounds
 _SLANTED = {"rotation": 25, "ha": "right", "rotation_mode": "anchor"}
 _SHARE_LABEL = "latency loss recovered (%)"
 
 
+@styled
 def overview(summary: pd.DataFrame, metric: str = "auc") -> Figure:
     """The mean with its interval for each forecaster and latency, and the recovered share beside.
 
@@ -64,11 +72,11 @@ def overview(summary: pd.DataFrame, metric: str = "auc") -> Figure:
         for axes in (left, right):
             axes.set_xticks(places, settings, **(_SLANTED if len(settings) > 4 else {}))
             axes.set_xlim(-0.5, len(settings) - 0.5)
-            axes.grid(axis="y", alpha=0.3)
+            axes.grid(visible=False, axis="x")
             for edge in range(1, len(settings)):
                 axes.axvline(edge - 0.5, color="0.85", linewidth=0.8)
     _within_limits(rows[0, 1].set_ylim, rows[0, 1].get_ylim())
-    _legend(figure, rows[0, 0], styles)
+    legend_below(figure, list(styles))
     return figure
 
 
@@ -92,32 +100,24 @@ def against(
     if value == "vs_hold":
         chosen = chosen[chosen["forecaster"] != "offline"]
     styles = _styles(chosen)
+    xlabel = "scale of the latency" if x == "scale" else "permitted latency σ (frames)"  # noqa: RUF001
+    ylabel = _label(metric) + (" minus that of hold" if value == "vs_hold" else "")
     other = "sigma" if x == "scale" else "scale"
-    groups = list(chosen.groupby(["trace", "latency", other], sort=False))
     several = chosen[other].nunique() > 1
-    figure, panels = _grid(len(groups), 3, 3.4)
-    for axes, ((trace, latency, rest), group) in zip(panels, groups):
+    panels = []
+    for (trace, latency, rest), group in chosen.groupby(["trace", "latency", other], sort=False):
         title = f"{trace}, {setting_label(latency, rest if other == 'scale' else 1)}"
-        axes.set_title(title + (rf", $\sigma$ = {rest:g}" if other == "sigma" and several else ""))
+        title += f", σ = {rest:g}" if other == "sigma" and several else ""  # noqa: RUF001
+        lines = []
         for name, style in styles.items():
             one = group[group["forecaster"] == name].sort_values(x)
-            if len(one) > 12:
-                style = {key: its for key, its in style.items() if key != "marker"}
-            axes.plot(one[x], one[value], label=name, **style)
-            if value == "vs_hold":
-                ends = one["vs_hold_low"], one["vs_hold_high"]
-                axes.fill_between(one[x], *ends, color=style["color"], alpha=0.12, linewidth=0)
-        axes.grid(alpha=0.3)
-        axes.set(
-            xlabel="scale of the latency"
-            if x == "scale"
-            else r"permitted latency $\sigma$ (frames)",
-            ylabel=_label(metric) + (" minus that of hold" if value == "vs_hold" else ""),
-        )
-    _legend(figure, panels[0], styles)
-    return figure
+            band = (one["vs_hold_low"], one["vs_hold_high"]) if value == "vs_hold" else None
+            lines.append(Line(name, one[x], one[value], style, band))
+        panels.append(Panel(title, xlabel, ylabel, lines, x == "scale" and group[x].min() > 0))
+    return draw_sweep(panels, 3, names=list(styles))
 
 
+@styled
 def attribute_bars(
     summary: pd.DataFrame, metric: str = "auc", value: Literal["recovered", "mean"] = "recovered"
 ) -> Figure:
@@ -139,10 +139,10 @@ def attribute_bars(
     groups = list(chosen.groupby(["trace", "latency", "scale", "sigma"], sort=False))
     places, factor = np.arange(len(counts)), 100 if value == "recovered" else 1
     height = 1.2 + len(counts) * max(0.35, 0.1 * len(rivals))
-    figure, panels = _grid(len(groups), 4, height, sharex=True, sharey=True)
+    figure, panels = panel_grid(len(groups), 4, 4, height, sharex=True, sharey=True)
     for axes, ((trace, latency, scale, sigma), group) in zip(panels, groups):
         title = f"{trace}, {setting_label(latency, scale)}"
-        axes.set_title(title + (rf", $\sigma$ = {sigma:g}" if sigma else ""))
+        axes.set_title(title + (f", σ = {sigma:g}" if sigma else ""))  # noqa: RUF001
         for name in styles if value == "mean" else rivals:
             one = group[group["forecaster"] == name].set_index("attribute").reindex(counts.index)
             known = one[value].notna().to_numpy()
@@ -165,11 +165,10 @@ def attribute_bars(
         )
         axes.axvline(0, color="0.4", linewidth=0.8)
         axes.set_yticks(places, [f"{name} (n = {count})" for name, count in counts.items()])
-        axes.grid(axis="x", alpha=0.3)
-        axes.set_axisbelow(True)
+        axes.grid(visible=False, axis="y")
     if factor == 100:
         _within_limits(panels[0].set_xlim, panels[0].get_xlim())
-    _legend(figure, panels[0], styles)
+    legend_below(figure, list(styles))
     return figure
 
 
@@ -180,18 +179,12 @@ def _few_traces(summary: pd.DataFrame) -> pd.DataFrame:
     return summary[together] if many and together.any() else summary
 
 
-def _styles(summary: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Colour, line and marker of each forecaster: hold first and grey, offline last, dashed."""
-    names = summary["forecaster"].unique()
-    others = [name for name in names if name not in ("hold", "offline")]
-    styles: dict[str, dict[str, Any]] = {}
-    if "hold" in names:
-        styles["hold"] = {"color": "0.5", "linestyle": "-", "marker": "o"}
-    for i, name in enumerate(others):
-        styles[name] = {"color": f"C{i}", "linestyle": "-", "marker": _MARKERS[(i + 1) % 10]}
-    if "offline" in names:
-        styles["offline"] = {"color": "black", "linestyle": "--"}
-    return styles
+def _styles(summary: pd.DataFrame) -> dict[str, Style]:
+    """The style of each forecaster, hold first, offline last."""
+    names = sorted(
+        summary["forecaster"].unique(), key=lambda name: (name != "hold", name == "offline")
+    )
+    return forecaster_styles(names)
 
 
 def _offset(names: Sequence[str], name: str) -> float:
@@ -227,27 +220,6 @@ def _errors(rows: pd.DataFrame, value: str, factor: float) -> Any:
 
 def _within_limits(setter: Any, limits: tuple[float, float]) -> None:
     setter(max(limits[0], _RECOVERED_LIMITS[0]), min(limits[1], _RECOVERED_LIMITS[1]))
-
-
-def _grid(count: int, columns: int, height: float, **settings: Any) -> tuple[Figure, list[Axes]]:
-    """A figure of so many panels, with up to so many columns."""
-    columns = min(count, columns)
-    rows = -(-count // columns)
-    figure = new_figure(max(7.0, 1 + 4 * columns), 0.6 + height * rows)
-    panels: list[Axes] = figure.subplots(rows, columns, squeeze=False, **settings).ravel().tolist()
-    for axes in panels[count:]:
-        axes.remove()
-    return figure, panels[:count]
-
-
-def _legend(figure: Figure, axes: Axes, names: Iterable[str]) -> None:
-    """One legend for all panels, below them."""
-    handles, labels = axes.get_legend_handles_labels()
-    by_name = dict(zip(labels, handles))
-    shown = [name for name in names if name in by_name]
-    columns = max(1, min(len(shown), int(figure.get_figwidth() // 2)))
-    ordered = [by_name[name] for name in shown]
-    figure.legend(ordered, shown, loc="outside lower center", ncols=columns)
 
 
 def _label(metric: str) -> str:

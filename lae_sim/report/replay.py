@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.comparison.statistics import recovered
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.report.table import table
+from lae_sim.report.table import (
+    CHANGE,
+    PERCENT,
+    Column,
+    Number,
+    Table,
+    relative_change,
+    text_of,
+)
 from lae_sim.trace.metadata import Metadata
 
 Report = dict[str, Any]
@@ -111,21 +121,21 @@ def _scores(
     means: Report = {m: _mean(evaluation.scores[m][f, which, s]) for m in METRICS}
     hold = forecasters.index("hold")
     for metric in ("auc", "dp20"):
-        recovered = None
+        share = None
         if f != hold and not evaluation.missing[which].any():
             scores = evaluation.scores[metric]
-            recovered = _recovered(
+            share = _recovered(
                 evaluation.offline[metric][which], scores[hold, which, s], scores[f, which, s]
             )
-        means[f"recovered_{metric}"] = recovered
+        means[f"recovered_{metric}"] = share
     return means
 
 
 def _recovered(offline: Floats, hold: Floats, forecast: Floats) -> float | None:
     """Share of the latency loss recovered, over sequences that count in all; none if no loss."""
     counted = ~np.isnan(offline + hold + forecast)
-    loss = float((offline - hold)[counted].sum())
-    return float((forecast - hold)[counted].sum()) / loss if loss > 0 else None
+    won, lost = (float((scores - hold)[counted].sum()) for scores in (forecast, offline))
+    return recovered(won, lost)
 
 
 def _offline(evaluation: Evaluation, metric: str, which: slice | list[int]) -> float | None:
@@ -180,6 +190,51 @@ SWEPT = {"fps": "fps", "latency_scale": "scale"}
 """What a sweep can vary, by its name in reports, with the heading of its column."""
 
 
+@dataclass(frozen=True)
+class _Line:
+    """A line of a table.
+
+    Attributes:
+        label: what it is about.
+        report: of its trace.
+        result: of its forecaster and permitted latency.
+        scores: the result, or a part of it.
+    """
+
+    label: str
+    report: Report
+    result: Report
+    scores: Report
+
+
+_SCORE, _FRAMES = Number(".4f"), Number(".3f", unit=" fr")
+_SIGMA = Column("sigma", lambda line: line.result["sigma"], Number("g"))
+
+
+def _labels(title: str, swept: Sequence[str]) -> list[Column]:
+    return [
+        Column(title, lambda line: line.label, is_label=True),
+        Column("forecaster", lambda line: line.result["forecaster"], is_label=True),
+        *(_of_report(SWEPT[key], key) for key in swept),
+    ]
+
+
+def _of_report(title: str, key: str, form: Callable[..., str] = str) -> Column:
+    return Column(title, lambda line: line.report[key], form)
+
+
+def _of_scores(title: str, key: str, form: Callable[..., str] = _SCORE) -> Column:
+    return Column(title, lambda line: line.scores[key], form)
+
+
+def _shown(reports: Iterable[tuple[str, Report]], shown_sigmas: Sequence[float]) -> Iterator[_Line]:
+    """A line per label and report, forecaster and permitted latency."""
+    for label, report in reports:
+        for result in report["results"]:
+            if result["sigma"] in shown_sigmas:
+                yield _Line(label, report, result, result)
+
+
 def summary_table(
     reports: Sequence[Report],
     labels: Sequence[str],
@@ -194,28 +249,36 @@ def summary_table(
         shown_sigmas: permitted latencies to show.
         swept: those of ``SWEPT`` that get a column.
     """
-    grid = any("mauc" in result for report in reports for result in report["results"])
-    header = ["trace", "forecaster", *(SWEPT[name] for name in swept)]
-    header += ["sigma"] if len(shown_sigmas) > 1 or shown_sigmas != [0.0] else []
-    header += ["AUC", "offline", "change", "recov.", "DP@20", "offline", "change", "recov."]
-    header += ["mAUC", "mDP"] if grid else []
-    header += ["tracker", "skipped", "mismatch"]
-    lines = []
-    for label, report in zip(labels, reports):
-        for result in report["results"]:
-            if result["sigma"] not in shown_sigmas:
-                continue
-            line = [label, result["forecaster"], *(report[name] for name in swept)]
-            line += [f"{result['sigma']:g}"] if "sigma" in header else []
-            for metric in ("auc", "dp20"):
-                offline = report["offline"] and report["offline"][metric]
-                line += [_score(result[metric]), _score(offline), _change(result[metric], offline)]
-                line += [_percent(result[f"recovered_{metric}"])]
-            line += [_score(result["mauc"]), _score(result["mdp"])] if grid else []
-            fps = report["tracker_fps"]
-            line += ["-" if fps is None else f"{fps:.1f} fps", _percent(report["skip_rate"])]
-            lines.append([*line, f"{result['mismatch_mean']:.3f} fr"])
-    return table(header, lines)
+    columns = _labels("trace", swept)
+    if len(shown_sigmas) > 1 or shown_sigmas != [0.0]:
+        columns.append(_SIGMA)
+    for title, metric in (("AUC", "auc"), ("DP@20", "dp20")):
+        columns += [
+            _of_scores(title, metric),
+            *_offline_columns(metric),
+            _of_scores("recov.", f"recovered_{metric}", PERCENT),
+        ]
+    if any("mauc" in result for report in reports for result in report["results"]):
+        columns += [_of_scores("mAUC", "mauc"), _of_scores("mDP", "mdp")]
+    columns += [
+        _of_report("tracker", "tracker_fps", Number(".1f", unit=" fps")),
+        _of_report("skipped", "skip_rate", PERCENT),
+        _of_scores("mismatch", "mismatch_mean", _FRAMES),
+    ]
+    return text_of(Table.of(columns, _shown(zip(labels, reports), shown_sigmas)))
+
+
+def _offline_columns(metric: str) -> list[Column]:
+    """The offline score, and how far the score is from it."""
+
+    def offline(line: _Line) -> float | None:
+        scores = line.report["offline"]
+        return None if scores is None else scores[metric]
+
+    def change(line: _Line) -> float | None:
+        return relative_change(line.scores[metric], offline(line))
+
+    return [Column("offline", offline, _SCORE), Column("change", change, CHANGE)]
 
 
 def settings_text(report: Report) -> str:
@@ -258,48 +321,44 @@ def attribute_table(
     report: Report, shown_sigmas: Sequence[float], swept: Sequence[str] = ()
 ) -> str:
     """One line per attribute and forecaster."""
-    header = ["attribute", "forecaster", *(SWEPT[name] for name in swept)]
-    header += ["sequences", "sigma", "AUC", "recovered", "DP@20"]
-    lines = [
-        [name, result["forecaster"], *(report[name] for name in swept)]
-        + [str(scores["sequences"]), f"{result['sigma']:g}"]
-        + [_score(scores["auc"]), _percent(scores["recovered_auc"]), _score(scores["dp20"])]
-        for result in _shown(report, shown_sigmas)
-        for name, scores in result["attributes"].items()
+    columns = [
+        *_labels("attribute", swept),
+        _of_scores("sequences", "sequences", str),
+        _SIGMA,
+        _of_scores("AUC", "auc"),
+        _of_scores("recovered", "recovered_auc", PERCENT),
+        _of_scores("DP@20", "dp20"),
     ]
-    return table(header, sorted(lines, key=lambda line: line[0]))
+    lines = [
+        replace(line, label=name, scores=scores)
+        for line in _shown([("", report)], shown_sigmas)
+        for name, scores in line.result["attributes"].items()
+    ]
+    return text_of(Table.of(columns, sorted(lines, key=lambda line: line.label)))
 
 
 def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequence[str] = ()) -> str:
     """One line per sequence and forecaster."""
-    header = ["sequence", "forecaster", *(SWEPT[name] for name in swept)]
-    header += ["sigma", "AUC", "offline", "DP@20", "offline"]
-    header += ["frames", "processed", "mismatch", "approximate", "disagree"]
-    lines = [
-        [one["sequence"], result["forecaster"], *(report[name] for name in swept)]
-        + [f"{result['sigma']:g}"]
-        + [_score(one["auc"]), _score(one["offline_auc"])]
-        + [_score(one["dp20"]), _score(one["offline_dp20"])]
-        + [str(one["world_frames"]), str(one["processed"])]
-        + [f"{one['mismatch_sum'] / one['world_frames']:.3f} fr"]
-        + [str(one["approximate_outputs"]), _percent(one["disagreement"])]
-        for result in _shown(report, shown_sigmas)
-        for one in result["per_sequence"]
+    columns = [
+        *_labels("sequence", swept),
+        _SIGMA,
+        _of_scores("AUC", "auc"),
+        _of_scores("offline", "offline_auc"),
+        _of_scores("DP@20", "dp20"),
+        _of_scores("offline", "offline_dp20"),
+        _of_scores("frames", "world_frames", str),
+        _of_scores("processed", "processed", str),
+        Column(
+            "mismatch",
+            lambda line: line.scores["mismatch_sum"] / line.scores["world_frames"],
+            _FRAMES,
+        ),
+        _of_scores("approximate", "approximate_outputs", str),
+        _of_scores("disagree", "disagreement", PERCENT),
     ]
-    return table(header, sorted(lines, key=lambda line: line[0]))
-
-
-def _shown(report: Report, shown_sigmas: Sequence[float]) -> list[Report]:
-    return [result for result in report["results"] if result["sigma"] in shown_sigmas]
-
-
-def _score(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f}%"
-
-
-def _change(value: float | None, offline: float | None) -> str:
-    return "-" if value is None or not offline else f"{100 * (value / offline - 1):+.1f}%"
+    lines = [
+        replace(line, label=scores["sequence"], scores=scores)
+        for line in _shown([("", report)], shown_sigmas)
+        for scores in line.result["per_sequence"]
+    ]
+    return text_of(Table.of(columns, sorted(lines, key=lambda line: line.label)))

@@ -1,18 +1,21 @@
-"""The tables of a study: what the page shows, and CSV and LaTeX for a paper.
+"""The tables of a study: for its page, as CSV and LaTeX for a paper, and as text for a terminal.
 
-Tables for a paper show the settings that stand for all (see :mod:`lae_sim.report.study_view`).
+Tables for a paper show the settings that stand for all (see :mod:`lae_sim.report.study_view`), and
+those for a terminal fewer columns.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.comparison.statistics import ALL_TRACES
 from lae_sim.files import written_whole
-from lae_sim.report.study_text import number, percent
 from lae_sim.report.study_view import (
     SETTINGS,
     View,
@@ -20,133 +23,145 @@ from lae_sim.report.study_view import (
     run_of,
     setting_of,
     several,
-    told_setting,
+    shared_setting,
 )
-from lae_sim.report.table import Entry, Table, latex, p_label, printable, write_csv
-from lae_sim.study.summary import MEAN, Row
+from lae_sim.report.table import (
+    CHANGE,
+    PERCENT,
+    SCORE,
+    SIGNED,
+    UNKNOWN,
+    Cell,
+    Column,
+    Interval,
+    Number,
+    Table,
+    latex_of,
+    p_label,
+    printable,
+    relative_change,
+    text_of,
+    write_csv,
+)
+from lae_sim.study.summary import MEAN
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
 
+Row = Mapping[str, Any]
 
 MOST_PAIRS = 300
 """Comparisons that are shown, at most, before only those of settings that stand for all are."""
 
-_Cell = Callable[[Row], Entry]
+
+def _field(key: str) -> Callable[[Row], Any]:
+    """A value of a row, None where the row has none."""
+    return lambda row: row.get(key)
 
 
-def _number(
-    name: str, form: str = ".3f", factor: float = 1, unit: str = "", ends: str = ""
-) -> _Cell:
-    """A number of a row, with its interval where it has one."""
+def _ends(key: str) -> Callable[[Row], Interval | None]:
+    """The interval of a value of a row."""
 
-    def entry(row: Mapping[str, Any]) -> Entry:
-        value, low, high = (row.get(name + end) for end in ("", "_low", "_high"))
-        if value is None or value != value:
-            return Entry("-", None)
-        text = f"{factor * value:{form}}{unit}"
-        if low is None or high is None or low != low:
-            return Entry(text, value)
-        about = f"{factor * low:{ends or form}}, {factor * high:{ends or form}}"
-        return Entry(f"{text} [{about}]", value, (low, high))
+    def interval(row: Row) -> Interval | None:
+        low, high = row.get(f"{key}_low"), row.get(f"{key}_high")
+        return None if low is None or high is None else (low, high)
 
-    return entry
+    return interval
 
 
-def _share(name: str) -> _Cell:
-    return lambda row: Entry(percent(row.get(name)), row.get(name))
+def _number(title: str, key: str, form: Number = SCORE, meaning: str = "") -> Column:
+    """A column of numbers, with their intervals where they have some."""
+    return Column(title, _field(key), form, _ends(key), meaning)
 
 
-def _p(name: str) -> _Cell:
-    return lambda row: (
-        Entry("-", None) if (p := row.get(name)) is None or p != p else Entry(p_label(p), p)
-    )
-
-
-def _name(key: str) -> _Cell:
-    """A name, or an exact number that is sorted as one."""
+def _label(key: str, value: Callable[[Row], object] | None = None) -> Column:
+    """A column of names, or of exact numbers, which are sorted as such."""
+    value = value or _field(key)
     if key in ("scale", "fps"):
-        return lambda row: Entry(str(row[key]), eval_scale(row[key]))
-    return lambda row: Entry(printable(row[key]), str(row[key]))
+        return Column(
+            key, lambda row: Cell(str(value(row)), eval_scale(str(value(row)))), is_label=True
+        )
+    return Column(key, lambda row: str(value(row)), is_label=True)
 
 
-def _change(now: float | None, before: float | None) -> Entry:
-    """How much better or worse something is, relative to what it was."""
-    if now is None or not before:
-        return Entry("-", None)
-    return Entry(f"{100 * (now / before - 1):+.1f}%", now / before - 1)
+def _jitter(row: Row) -> Cell:
+    ends = _ends("auc_jitter")(row)
+    if ends is None:
+        return UNKNOWN
+    return Cell(f"{ends[0]:.3f} to {ends[1]:.3f}", ends[1] - ends[0], ends)
 
 
-def _jitter(row: Row) -> Entry:
-    if "auc_jitter_low" not in row:
-        return Entry("-", None)
-    low, high = row["auc_jitter_low"], row["auc_jitter_high"]
-    return Entry(f"{low:.3f} to {high:.3f}", high - low, (low, high))
-
-
-def _label(row: Row) -> Entry:
+def _exactness(row: Row) -> Cell:
     share = row["approximate_share"]
-    return Entry("exact" if row["exact"] else f"approximate ({100 * share:.3g}%)", share)
+    return Cell("exact" if row["exact"] else f"approximate ({100 * share:.3g}%)", share)
 
 
-_RECOVERED = _number("recovered_auc", ".1f", 100, "%", ".0f")
-_RANKING: dict[str, tuple[_Cell, str]] = {
-    "n": (_number("sequences", ".0f"), "number of sequences"),
-    "AUC": (_number("auc"), "with its 95 % interval over sequences"),
-    "jitter": (_jitter, "the range of 95 % of the repetitions' AUC"),
-    "offline": (_number("offline_auc"), "AUC without latency"),
-    "change": (lambda row: _change(row["auc"], row["offline_auc"]), "of the AUC, to offline"),
-    "recovered": (_RECOVERED, "share of the AUC lost to latency that the forecaster wins back"),
-    "vs hold": (_number("vs_hold_auc", "+.3f"), "AUC won over hold"),
-    "p": (_p("vs_hold_auc_p"), "of no difference to hold: Wilcoxon's signed-rank test over "
-          "sequences, not corrected"),
-    "DP": (_number("dp20"), "precision at 20 px"),
-    "offline DP": (_number("offline_dp20"), "without latency"),
-    "ms/call": (_number("elapsed_ms", ".1f"), "mean processing time"),
-    "skipped": (_share("skip_rate"), "share of frames never processed"),
-    "age ms": (_number("age_ms", ".0f"), "mean age of the outputs that answer, at the first sigma; "
-               "what forecasting costs is not in it"),
-    "stale ms": (_number("longest_stale_ms", ".0f"), "longest time that one output answered"),
-    "failed": (_share("failed"), "share of sequences in which an answer misses the target wholly"),
-    "to failure s": (_number("time_to_failure_ms", ".1f", 1e-3), "median time to the first such "
-                     "answer (Kaplan and Meier); unknown if less than half fail"),
-    "front": (lambda row: Entry("★" if row["pareto"] else "", int(row["pareto"])),
-              "with the same forecaster, no other trace is both faster and better"),
-    "replay": (_label, "the share of outputs that follow another frame than when recorded"),
-    "engine": (_name("engine"), "batch, or simpy where policy or latency need it"),
-}  # fmt: skip
-TABLES = ("ranking", "table2", "attributes", "comparisons", "required")
+_COUNT, _RECOVERED = Number(".0f"), Number(".1f", 100, "%", ".0f")
+_RANKING = (
+    _number("n", "sequences", _COUNT, "number of sequences"),
+    _number("AUC", "auc", meaning="with its 95 % interval over sequences"),
+    Column("jitter", _jitter, meaning="the range of 95 % of the repetitions' AUC"),
+    _number("offline", "offline_auc", meaning="AUC without latency"),
+    Column("change", lambda row: relative_change(row["auc"], row["offline_auc"]), CHANGE,
+           meaning="of the AUC, to offline"),
+    _number("recovered", "recovered_auc", _RECOVERED,
+            "share of the AUC lost to latency that the forecaster wins back"),
+    _number("vs hold", "vs_hold_auc", SIGNED, "AUC won over hold"),
+    Column("p", _field("vs_hold_auc_p"), p_label, meaning="of no difference to hold: Wilcoxon's "
+           "signed-rank test over sequences, not corrected"),
+    _number("DP", "dp20", meaning="precision at 20 px"),
+    _number("offline DP", "offline_dp20", meaning="without latency"),
+    _number("ms/call", "elapsed_ms", Number(".1f"), "mean processing time"),
+    _number("skipped", "skip_rate", PERCENT, "share of frames never processed"),
+    _number("age ms", "age_ms", Number(".0f"), "mean age of the outputs that answer, at the first "
+            "sigma; what forecasting costs is not in it"),
+    _number("stale ms", "longest_stale_ms", Number(".0f"), "longest time that one output answered"),
+    _number("failed", "failed", PERCENT,
+            "share of sequences in which an answer misses the target wholly"),
+    _number("to failure s", "time_to_failure_ms", Number(".1f", 1e-3), "median time to the first "
+            "such answer (Kaplan and Meier); unknown if less than half fail"),
+    Column("front", lambda row: Cell("★" if row["pareto"] else "", int(row["pareto"])),
+           meaning="with the same forecaster, no other trace is both faster and better"),
+    Column("replay", _exactness,
+           meaning="the share of outputs that follow another frame than when recorded"),
+    Column("engine", _field("engine"), meaning="batch, or simpy where policy or latency need it"),
+)  # fmt: skip
 _PAPER = ("AUC", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")
-LEGEND = {title: meaning for title, (_, meaning) in _RANKING.items()}
-"""What the columns of the ranking mean."""
+_TERMINAL = ("n", "AUC", "jitter", "offline", "recovered", "vs hold", "p", "DP", "ms/call",
+             "skipped", "age ms")  # fmt: skip
 
 
-def ranking(view: View) -> Table:
+def _ranked(view: View) -> list[Row]:
+    """The best AUC of each setting first."""
+    keys = ("dataset", *several(view.rows))
+    settings = [tuple(str(row[key]) for key in keys) for row in view.rows]
+    order = {setting: i for i, setting in reversed([*enumerate(settings)])}
+    ranks = [(order[s], -(row["auc"] or 0)) for s, row in zip(settings, view.rows)]
+    return [view.rows[i] for i in sorted(range(len(ranks)), key=ranks.__getitem__)]
+
+
+def _ranking_columns(
+    view: View, titles: Container[str], settings: Sequence[str] = ()
+) -> list[Column]:
+    repeated = any("auc_jitter_low" in row for row in view.rows)
+    return [
+        _label("tracker", lambda row: view.names[run_of(row)]),
+        *map(_label, ("forecaster", "dataset", *settings)),
+        *(column for column in _RANKING if column.title in titles
+          and (repeated or column.title != "jitter")),
+    ]  # fmt: skip
+
+
+def ranking(view: View, for_paper: bool = False) -> Table:
     """A row per trace, setting and forecaster, the best AUC of a setting first."""
-    differ = several(view.rows)
-
-    def key(row: Row) -> tuple[str, ...]:
-        return (row["dataset"], *(str(row[name]) for name in differ))
-
-    order = {its: i for i, its in enumerate(dict.fromkeys(map(key, view.rows)))}
-    rows = sorted(view.rows, key=lambda row: (order[key(row)], -(row["auc"] or 0)))
-    header = ["tracker", "forecaster", "dataset", *differ]
-    repeated = any("auc_jitter_low" in row for row in rows)
-    titles = [title for title in _RANKING if repeated or title != "jitter"]
-    cells = [*map(_name, header), *(_RANKING[title][0] for title in titles)]
-    named = [{**row, "tracker": view.names[run_of(row)]} for row in rows]
-    paper = [c for c, title in enumerate([*header, *titles]) if title in (
-        "dataset", "tracker", "forecaster", *_PAPER
-    )]  # fmt: skip
-    return Table(
-        "ranking",
-        f"The best AUC of each setting first: {told_setting(rows)}",
-        (*header, *titles),
-        tuple(tuple(cell(row) for cell in cells) for row in named),
-        len(header),
-        paper=(paper, [i for i, row in enumerate(rows) if view.stands(row)]),
-        paper_caption=f"The best AUC first: {told_setting(view.standing)}",
-    )
+    rows = _ranked(view)
+    if for_paper:
+        rows = [row for row in rows if view.stands(row)]
+        caption = f"The best AUC first: {shared_setting(view.standing)}"
+        return Table.of(_ranking_columns(view, _PAPER), rows, "ranking", caption)
+    columns = _ranking_columns(view, {c.title for c in _RANKING}, several(view.rows))
+    caption = f"The best AUC of each setting first: {shared_setting(rows)}"
+    return Table.of(columns, rows, "ranking", caption)
 
 
 def table2(view: View) -> Table:
@@ -157,118 +172,156 @@ def table2(view: View) -> Table:
     without. (Rows and columns are ours; the print may order them otherwise.)
     """
     rows = view.standing
-    found = {(view.names[run_of(row)], row["dataset"], row["forecaster"]): row for row in rows}
-    datasets = list(dict.fromkeys(row["dataset"] for row in rows))
+    by_name = {(view.names[run_of(row)], row["dataset"], row["forecaster"]): row for row in rows}
+    trackers = dict.fromkeys(tracker for tracker, _, _ in by_name)
     mean = "m" if rows[0]["sigma"] == MEAN else ""
-    lines = []
-    for tracker in dict.fromkeys(tracker for tracker, _, _ in found):
-        for forecaster in ("offline", *view.forecasters):
-            line = [Entry(tracker, tracker), Entry(printable(forecaster), forecaster)]
-            for dataset in datasets:
-                hold = found.get((tracker, dataset, "hold"), {})
-                row = found.get((tracker, dataset, forecaster), {})
-                for metric in ("auc", "dp20"):
-                    offline, held = hold.get(f"offline_{metric}"), hold.get(metric)
-                    now = offline if forecaster == "offline" else row.get(metric)
-                    before = {"offline": None, "hold": offline}.get(forecaster, held)
-                    line += [Entry(number(now), now), _change(now, before)]
-            lines.append(line)
-    for c in range(2, 2 + 4 * len(datasets), 2):
+
+    def columns(dataset: str, metric: str, title: str) -> list[Column]:
+        """A score and its change; records are a tracker and a forecaster."""
+
+        def score(record: tuple[str, str]) -> float | None:
+            tracker, forecaster = record
+            offline = forecaster == "offline"
+            row = by_name.get((tracker, dataset, "hold" if offline else forecaster), {})
+            return row.get(f"offline_{metric}" if offline else metric)
+
+        def change(record: tuple[str, str]) -> float | None:
+            tracker, forecaster = record
+            if forecaster == "offline":
+                return None
+            before = "offline" if forecaster == "hold" else "hold"
+            return relative_change(score(record), score((tracker, before)))
+
+        group = printable(dataset)
+        return [
+            Column(title, score, SCORE, group=group),
+            Column("Δ", change, CHANGE, group=group, name=f"{title} Δ"),
+        ]
+
+    scores = [
+        column
+        for dataset in dict.fromkeys(row["dataset"] for row in rows)
+        for metric, title in (("auc", f"{mean}AUC"), ("dp20", f"{mean}DP"))
+        for column in columns(dataset, metric, title)
+    ]
+    table = Table.of(
+        [
+            Column("tracker", itemgetter(0), is_label=True),
+            Column("forecaster", itemgetter(1), is_label=True),
+            *scores,
+        ],
+        product(trackers, ("offline", *view.forecasters)),
+        "table2",
+        "Trackers with and without forecasters: hold changes relative to offline, forecasters "
+        "relative to hold; the best of each column under latency is bold, the second underlined; "
+        + shared_setting(rows),
+    )
+    places = [c for c, column in enumerate(table.columns) if column.form is SCORE]
+    return replace(table, rows=_with_ranks(table.rows, places))
+
+
+def _with_ranks(
+    rows: Iterable[tuple[Cell, ...]], columns: Sequence[int]
+) -> tuple[tuple[Cell, ...], ...]:
+    """Mark the best and the second best of some columns, but for offline."""
+    lines = [list(row) for row in rows]
+    for c in columns:
         online = [line for line in lines if line[1].value != "offline" and line[c].value]
         for rank, text in enumerate(sorted({line[c].text for line in online})[:-3:-1], 1):
             for line in online:  # what reads the same is as good
                 if line[c].text == text:
-                    line[c] = Entry(text, line[c].value, rank=rank)
-    return Table(
-        "table2",
-        "Trackers with and without forecasters: hold changes relative to offline, forecasters "
-        "relative to hold; the best of each column under latency is bold, the second underlined; "
-        + told_setting(rows),
-        ("tracker", "forecaster", *[f"{mean}AUC", "Δ", f"{mean}DP", "Δ"] * len(datasets)),
-        tuple(map(tuple, lines)),
-        2,
-        tuple((printable(dataset), 4) for dataset in datasets),
-    )
+                    line[c] = replace(line[c], rank=rank)
+    return tuple(map(tuple, lines))
 
 
-def attribute_table(view: View) -> Table | None:
+def attribute_table(view: View, for_paper: bool = False) -> Table | None:
     """A row per attribute, tracker and forecaster; None if there are none."""
     if view.attributes is None:
         return None
-    keys, rows, offline = ("dataset", "attribute", "trace"), [], {}
-    for row in view.attributes.to_dict("records"):
-        row |= {"mean_low": row["low"], "mean_high": row["high"]}
-        if row["forecaster"] == "offline":
-            offline[tuple(row[key] for key in keys)] = row["mean"]
-            continue
-        if row["forecaster"] == "hold":
-            row |= dict.fromkeys(("vs_hold", "vs_hold_p", "recovered"))
-        rows.append(row)
-    cells = [
-        *map(_name, (*keys, "forecaster")),
-        _number("sequences", ".0f"), _number("mean"),
-        lambda row: _number("mean")({"mean": offline.get(tuple(row[key] for key in keys))}),
-        _number("vs_hold", "+.3f"), _p("vs_hold_p"),
-        _number("recovered", ".1f", 100, "%", ".0f"),
+    records = view.attributes.to_dict("records")
+    keys = ("dataset", "attribute", "trace")
+    offline = {
+        tuple(row[key] for key in keys): row["mean"]
+        for row in records
+        if row["forecaster"] == "offline"
+    }
+    rows = [row for row in records if row["forecaster"] != "offline"]
+    together = [row for row in rows if row["trace"] == ALL_TRACES]
+
+    def against_hold(key: str) -> Callable[[Row], Any]:
+        return lambda row: None if row["forecaster"] == "hold" else row[key]
+
+    columns = [
+        _label("dataset"), _label("attribute"),
+        replace(_label("trace"), title="tracker"), _label("forecaster"),
+        _number("n", "sequences", _COUNT),
+        Column("AUC", _field("mean"), SCORE, lambda row: (row["low"], row["high"])),
+        Column("offline", lambda row: offline.get(tuple(row[key] for key in keys)), SCORE),
+        Column("vs hold", against_hold("vs_hold"), SIGNED, _ends("vs_hold")),
+        Column("p", against_hold("vs_hold_p"), p_label),
+        Column("recovered", against_hold("recovered"), _RECOVERED, _ends("recovered")),
     ]  # fmt: skip
-    together = [i for i, row in enumerate(rows) if row["trace"] == ALL_TRACES]
-    header = ("dataset", "attribute", "tracker", "forecaster", "n", "AUC", "offline", "vs hold")
-    return Table(
+    return Table.of(
+        columns,
+        (for_paper and together) or rows,
         "attributes",
         "AUC on the sequences of each attribute (n of them), at the first sigma; "
-        + told_setting(view.standing, but="sigma"),
-        (*header, "p", "recovered"),
-        tuple(tuple(cell(row) for cell in cells) for row in rows),
-        4,
-        paper=(range(len(cells)), together or range(len(rows))),
+        + shared_setting(view.standing, but="sigma"),
     )
 
 
 def comparison_table(view: View) -> Table:
     """A row per pair of traces; where there are many, of settings that stand for all."""
-    rows, told = list(view.results.comparisons), ""
+    rows, left_out = list(view.results.comparisons), ""
     if len(rows) > MOST_PAIRS:
         rows = [row for row in rows if view.chosen[row["a"]] == setting_of(row)]
-        told = f"; {len(view.results.comparisons):,} pairs of all settings are in comparisons.csv"
-    keys = [key for key in ("dataset", *SETTINGS[1:]) if len({row[key] for row in rows}) > 1]
-    keys += ["forecaster", "a", "b"]
-    named = [{**row, "a": view.names[row["a"]], "b": view.names[row["b"]]} for row in rows]
-    cells = [
-        *map(_name, keys), _number("sequences", ".0f"), _number("difference", "+.3f"), _p("p"),
-        _p("p_holm"),
-        _number("better_here", ".2f"), _number("better", ".2f"),
-    ]  # fmt: skip
-    return Table(
-        "comparisons",
-        f"Trackers against each other{told}",
-        (*keys, "n", "AUC of a - b", "p", "p (Holm)", "a better here", "a better"),
-        tuple(tuple(cell(row) for cell in cells) for row in named),
-        len(keys),
-    )
+        left_out = f"; {len(view.results.comparisons):,} pairs of all settings are in "
+        left_out += "comparisons.csv"
+    keys = _differing(rows, ("dataset", *SETTINGS[1:]))
+    columns = [
+        *map(_label, (*keys, "forecaster")),
+        _label("a", lambda row: view.names[row["a"]]),
+        _label("b", lambda row: view.names[row["b"]]),
+        _number("n", "sequences", _COUNT),
+        _number("AUC of a - b", "difference", SIGNED),
+        Column("p", _field("p"), p_label),
+        Column("p (Holm)", _field("p_holm"), p_label),
+        _number("a better here", "better_here", Number(".2f")),
+        _number("a better", "better", Number(".2f")),
+    ]
+    return Table.of(columns, rows, "comparisons", f"Trackers against each other{left_out}")
 
 
 def required_table(view: View) -> Table:
     """A row per trace, setting and forecaster: how slow it may be."""
-    rows = [{**row, "trace": run_of(row)} for row in view.results.required]
-    for row in rows:
-        row["most"] = None if row["scale"] is None else eval_scale(row["scale"])
-    keys = [key for key in ("policy", "fps", "latency", "convention")
-            if len({row[key] for row in rows}) > 1]  # fmt: skip
-    keys = ["trace", *keys, "forecaster"]
-    cells = [
-        *map(_name, keys), _number("required_auc", ".3g"), _number("auc_without_latency"),
-        _number("most", ".2f"), _number("auc"), _number("speed_up", ".2f"),
-        _number("fps_at_most", ".1f"),
-    ]  # fmt: skip
-    header = ("AUC asked", "without latency", "times at most x", "AUC there", "speed-up needed")
-    return Table(
+    rows = view.results.required
+    keys = _differing(rows, ("policy", "fps", "latency", "convention"))
+    columns = [
+        _label("trace", run_of),
+        *map(_label, (*keys, "forecaster")),
+        _number("AUC asked", "required_auc", Number(".3g")),
+        _number("without latency", "auc_without_latency"),
+        Column("times at most x", _most, Number(".2f")),
+        _number("AUC there", "auc"),
+        _number("speed-up needed", "speed_up", Number(".2f")),
+        _number("world fps at most", "fps_at_most", Number(".1f")),
+    ]
+    return Table.of(
+        columns,
+        rows,
         "required",
         "How slow a device may be, and how fast the world may move (with the recorded motion from "
         f"frame to frame), for the required AUC at sigma {rows[0]['sigma']}",
-        (*keys, *header, "world fps at most"),
-        tuple(tuple(cell(row) for cell in cells) for row in rows),
-        len(keys),
     )
+
+
+def _most(row: Row) -> float | None:
+    return None if row["scale"] is None else eval_scale(row["scale"])
+
+
+def _differing(rows: Iterable[Row], keys: Iterable[str]) -> list[str]:
+    """The keys whose values differ between rows."""
+    return [key for key in keys if len({row[key] for row in rows}) > 1]
 
 
 def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -> None:
@@ -284,19 +337,78 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
     view = results if isinstance(results, View) else View(results)
     results = view.results
     Path(folder).mkdir(parents=True, exist_ok=True)
-    tables: Sequence[Table | None] = (
-        ranking(view),
-        table2(view),
-        attribute_table(view),
-        comparison_table(view) if results.comparisons else None,
-        required_table(view) if results.required else None,
+    compared = comparison_table(view) if results.comparisons else None
+    required = required_table(view) if results.required else None
+    tables = {  # whole, and for a paper
+        "ranking": (ranking(view), ranking(view, for_paper=True)),
+        "table2": (table2(view),) * 2,
+        "attributes": (attribute_table(view), attribute_table(view, for_paper=True)),
+        "comparisons": (compared, compared),
+        "required": (required, required),
+    }
+    for name, (whole, for_paper) in tables.items():
+        csv, tex = (Path(folder, f"{name}.{ending}") for ending in ("csv", "tex"))
+        for path in (csv, tex):
+            path.unlink(missing_ok=True)  # it would be of other results
+        if whole is not None and for_paper is not None:
+            with written_whole(csv) as temporary:
+                write_csv(whole, temporary)
+            with written_whole(tex) as temporary:
+                temporary.write_text(latex_of(for_paper), "utf-8")
+
+
+def study_text(results: StudyResults | View) -> str:
+    """The tables for a terminal, then what they rest on."""
+    view = results if isinstance(results, View) else View(results)
+    results, parts = view.results, [_ranking_text(view)]
+    repeated = any(row["repetitions"] > 1 for row in view.rows)
+    if results.comparisons and (repeated or len(results.comparisons) <= 30):
+        parts.append(
+            f"{text_of(comparison_table(view))}\na better here: probability that one run of a "
+            "beats one of b on these sequences; a better: on others like them"
+        )
+    if results.required:
+        parts.append(_required_text(view))
+    lines = [f"{len(results.plan.cells)} cells, {results.computed} of them computed now"]
+    approximate = [row["approximate_share"] for row in view.rows if not row["exact"]]
+    if approximate:
+        lines.append(
+            f"approximate: up to {100 * max(approximate):.3g}% of the outputs of a replay follow "
+            "another frame than when recorded"
+        )
+    lines += [f"not computed: {each['of']}: {each['reason']}" for each in results.failures]
+    return "\n\n".join([*parts, "\n".join([*lines, *results.notes()])])
+
+
+def _ranking_text(view: View) -> str:
+    rows = _ranked(view)
+    front = Column("front", lambda row: "*" * row["pareto"])  # not every terminal has stars
+    columns = [
+        column if column.title == "AUC" else replace(column, interval=None)
+        for column in _ranking_columns(view, _TERMINAL, several(view.rows))
+        if column.title != "dataset" or _differing(rows, ["dataset"])
+    ] + [front]
+    return (
+        f"{shared_setting(rows)}\n{text_of(Table.of(columns, rows))}\n"
+        "[ ]: 95 % bootstrap over sequences; jitter: 95 % of the repetitions; p: Wilcoxon's "
+        "signed-rank test;\nn: sequences; front: with this forecaster no other trace is both "
+        "faster and better" + "; age at the first sigma" * bool(rows[0]["sigma"] == MEAN)
     )
-    for stale in (*Path(folder).glob("*.csv"), *Path(folder).glob("*.tex")):
-        if stale.stem in TABLES:
-            stale.unlink()
-    for table in tables:
-        if table is not None:
-            with written_whole(Path(folder, f"{table.name}.csv")) as temporary:
-                write_csv(table, temporary)
-            with written_whole(Path(folder, f"{table.name}.tex")) as temporary:
-                temporary.write_text(latex(table), "utf-8")
+
+
+def _required_text(view: View) -> str:
+    table, rows = required_table(view), view.results.required
+    at_least = [" " if row["beyond"] is not None else ">=" for row in rows]
+    place = table.header.index("times at most x")
+    cells = [
+        (*row[:place], replace(row[place], text=f"{sign} {row[place].text}"), *row[place + 1 :])
+        if row[place] != UNKNOWN
+        else row
+        for row, sign in zip(table.rows, at_least)
+    ]
+    return (
+        f"{text_of(replace(table, rows=tuple(cells)))}\ntimes at most: by bisection, in steps of "
+        f"0.01; all at sigma {rows[0]['sigma']}; world fps at most: how fast the\nworld may move, "
+        "with the recorded motion from frame to frame (unknown where a cost or a policy has a time "
+        "of its own)"
+    )

@@ -124,7 +124,7 @@ class View:
                 yield {**row, "sequence": scores.sequences[s], "value": float(aucs[s])}
 
 
-def row_of(scores: Scores) -> Row:
+def row_of(scores: Scores) -> dict[str, Any]:
     """What says which scores these are, as the rows of the summary say it."""
     return {
         **scores.setting.columns(),
@@ -135,7 +135,7 @@ def row_of(scores: Scores) -> Row:
     }
 
 
-def told_setting(rows: Sequence[Row], but: str = "") -> str:
+def shared_setting(rows: Sequence[Mapping[str, Any]], but: str = "") -> str:
     """What some rows have in common, in words; one key may be left out."""
     parts = []
     labels = ("policy", "world", "latency", "times x", "convention")

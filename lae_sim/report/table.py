@@ -1,57 +1,85 @@
-"""Tables for a page, as CSV and as LaTeX."""
+"""Tables: columns that say how records are shown, as aligned text, CSV and LaTeX.
+
+HTML is made of the same tables by the template of the page (see :mod:`lae_sim.report.page`).
+"""
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Entry:
+class Cell:
     """One cell of a table.
 
     Attributes:
         text: as people read it.
         value: what it is sorted by, and what CSV holds; None if unknown.
-        ends: of an interval.
+        interval: around the value, if it has one.
         rank: 1 or 2 if it is the best or second best of its column.
     """
 
     text: str
     value: float | str | None
-    ends: tuple[float, float] | None = None
+    interval: Interval | None = None
     rank: int = 0
 
 
+UNKNOWN = Cell("-", None)
+
+
 @dataclass(frozen=True)
-class Table:
-    """A table for a page, CSV and LaTeX.
+class Number:
+    """How numbers are written: called with one, it gives the text; a dash for None and NaN.
 
     Attributes:
-        name: of its files.
-        caption: what it shows.
-        header: of the columns.
-        rows: an entry per column.
-        left: so many first columns hold names.
-        groups: titles above the other columns, each with the number of its columns.
-        paper: places of the columns, and of the rows, that fit in a paper; all if None.
-        paper_caption: what these show, if it is less.
+        form: a format specification.
+        factor: what the number is multiplied by.
+        unit: what follows it.
+        ends: the format specification of an interval's ends, if it is another.
     """
 
-    name: str
-    caption: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[Entry, ...], ...]
-    left: int
-    groups: tuple[tuple[str, int], ...] = ()
-    paper: tuple[Sequence[int], Sequence[int]] | None = None
-    paper_caption: str = ""
+    form: str = ".3f"
+    factor: float = 1
+    unit: str = ""
+    ends: str = ""
+
+    def __call__(self, value: float | None, interval: Interval | None = None) -> str:
+        """A number as text, with its interval in brackets."""
+        if is_unknown(value):
+            return UNKNOWN.text
+        text = f"{self.factor * value:{self.form}}{self.unit}"  # type: ignore[operator]
+        if interval is None:
+            return text
+        low, high = (f"{self.factor * end:{self.ends or self.form}}" for end in interval)
+        return f"{text} [{low}, {high}]"
+
+
+SCORE, SIGNED, COUNT = Number(), Number("+.3f"), Number(",")
+PERCENT, CHANGE = Number(".1f", 100, "%"), Number("+.1f", 100, "%")
+
+
+def is_unknown(value: Any) -> bool:
+    """Whether a value is None or NaN."""
+    return value is None or value != value
+
+
+def p_label(p: float | None) -> str:
+    """A p value as text: ``"0.013"``, ``"<0.001"``, or ``"-"`` if it is not known."""
+    return "<0.001" if not is_unknown(p) and p < 0.001 else SCORE(p)  # type: ignore[operator]
+
+
+def relative_change(value: float | None, before: float | None) -> float | None:
+    """How much larger a value is, relative to what it was; None if that is unknown or 0."""
+    return None if value is None or not before else value / before - 1
 
 
 def printable(text: object) -> str:
@@ -59,66 +87,154 @@ def printable(text: object) -> str:
     return "".join(c if c.isprintable() else " " for c in str(text))
 
 
+@dataclass(frozen=True)
+class Column:
+    """A column: what of a record it shows, and how.
+
+    Attributes:
+        title: its heading.
+        value: of a record: a number, a text, None if it is unknown, or a whole `Cell`.
+        form: makes text of a value; numbers may be written with their interval.
+        interval: of a record, or None.
+        meaning: what the column holds, where the heading does not say it.
+        is_label: whether it names the rows; such columns come first, and are left-aligned.
+        group: a heading above this and the neighbouring columns of the same group.
+        name: its heading in CSV, if it is not the title.
+    """
+
+    title: str
+    value: Callable[[Any], Any]
+    form: Callable[..., str] = printable
+    interval: Callable[[Any], Interval | None] | None = None
+    meaning: str = ""
+    is_label: bool = False
+    group: str = ""
+    name: str = ""
+
+    def cell(self, record: Any) -> Cell:
+        """What the column shows of a record."""
+        value = self.value(record)
+        if isinstance(value, Cell):
+            return value
+        if is_unknown(value):
+            return UNKNOWN
+        interval = self.interval(record) if self.interval else None
+        if interval is None or is_unknown(interval[0]):
+            return Cell(self.form(value), value)
+        return Cell(self.form(value, interval), value, interval)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table, to be shown as text, CSV, LaTeX or HTML.
+
+    Attributes:
+        name: of its files.
+        caption: what it shows.
+        columns: its columns.
+        rows: a cell per column.
+    """
+
+    name: str
+    caption: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    @classmethod
+    def of(
+        cls, columns: Iterable[Column], records: Iterable[Any], name: str = "", caption: str = ""
+    ) -> Table:
+        """The table with a row per record."""
+        columns = tuple(columns)
+        rows = tuple(tuple(column.cell(record) for column in columns) for record in records)
+        return cls(name, caption, columns, rows)
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """The titles of the columns."""
+        return tuple(column.title for column in self.columns)
+
+    @property
+    def labels(self) -> int:
+        """The number of columns that name the rows."""
+        return sum(column.is_label for column in self.columns)
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Headings above the other columns, each with the number of its columns."""
+        titles = [column.group for column in self.columns if column.group]
+        return [(title, len(list(members))) for title, members in groupby(titles)]
+
+
+def text_of(table: Table) -> str:
+    """A table as aligned text, for a terminal."""
+    return aligned(table.header, [[c.text for c in row] for row in table.rows], table.labels)
+
+
+def aligned(header: Sequence[str], lines: Sequence[Sequence[str]], labels: int = 2) -> str:
+    """Columns of text: the first ``labels`` to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(header, *lines)]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = [
+            cell.ljust(width) if i < labels else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(cells, widths))
+        ]
+        return "  ".join(padded).rstrip()
+
+    return "\n".join(map(line, [header, ["-" * width for width in widths], *lines]))
+
+
 def write_csv(table: Table, path: Path) -> None:
     """Write a table as CSV, with numbers in full; what is unknown is empty."""
-    above = [title for title, count in table.groups for _ in range(count)]
-    titles = [
-        f"{above[c - table.left]} {title}" if above and c >= table.left else title
-        for c, title in enumerate(
-            f"{before} {title}" if title == "Δ" else title
-            for before, title in zip(("", *table.header), table.header)
-        )
-    ]
-    wide = [any(row[c].ends for row in table.rows) for c in range(len(titles))]
     header: list[str] = []
-    for title, has_ends in zip(titles, wide):
-        header += [title, f"{title} low", f"{title} high"] if has_ends else [title]
+    has_interval = [any(row[c].interval for row in table.rows) for c in range(len(table.columns))]
+    for column, wide in zip(table.columns, has_interval):
+        title = f"{column.group} {column.name or column.title}".lstrip()
+        header += [title, f"{title} low", f"{title} high"] if wide else [title]
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
         for row in table.rows:
             line: list[Any] = []
-            for entry, has_ends in zip(row, wide):
-                line += [entry.value, *(entry.ends or (None, None))] if has_ends else [entry.value]
+            for cell, wide in zip(row, has_interval):
+                line += [cell.value, *(cell.interval or (None, None))] if wide else [cell.value]
             writer.writerow(line)
 
 
-def latex(table: Table) -> str:
+def latex_of(table: Table) -> str:
     """A table in LaTeX, of the package booktabs."""
-    columns, lines = table.paper or (range(len(table.header)), range(len(table.rows)))
-    left = sum(c < table.left for c in columns)
+    labels, groups = table.labels, table.groups
     text = [
-        rf"% {printable(table.paper_caption or table.caption)}",
+        rf"% {printable(table.caption)}",
         r"% \usepackage{booktabs}; if it is too wide: \usepackage{adjustbox} and",
         rf"% \adjustbox{{max width=\linewidth}}{{\input{{{table.name}}}}}",
-        rf"\begin{{tabular}}{{@{{}}{'l' * left}{'r' * (len(columns) - left)}@{{}}}}",
+        rf"\begin{{tabular}}{{@{{}}{'l' * labels}{'r' * (len(table.columns) - labels)}@{{}}}}",
         r"\toprule",
     ]
-    if table.groups:
-        titles = [rf"\multicolumn{{{n}}}{{c}}{{{tex(title)}}}" for title, n in table.groups]
-        text.append(" & ".join([*[""] * left, *titles]) + r" \\")
-        begins = [left + 1 + sum(n for _, n in table.groups[:g]) for g in range(len(titles))]
+    if groups:
+        titles = [rf"\multicolumn{{{n}}}{{c}}{{{tex(title)}}}" for title, n in groups]
+        text.append(" & ".join([*[""] * labels, *titles]) + r" \\")
+        begins = [labels + 1 + sum(n for _, n in groups[:g]) for g in range(len(groups))]
         text.append("".join(
-            rf"\cmidrule(lr){{{begin}-{begin + n - 1}}}"
-            for begin, (_, n) in zip(begins, table.groups)
+            rf"\cmidrule(lr){{{begin}-{begin + n - 1}}}" for begin, (_, n) in zip(begins, groups)
         ))  # fmt: skip
-    text += [" & ".join(tex(table.header[c]) for c in columns) + r" \\", r"\midrule"]
+    text += [" & ".join(map(tex, table.header)) + r" \\", r"\midrule"]
     previous = None
-    for number_, i in enumerate(lines):
-        row = table.rows[i]
-        if table.groups and number_ and row[0] != previous:
-            text.append(r"\midrule")
-        cells = [_ranked(row[c]) for c in columns]
-        if table.groups and row[0] == previous:
+    for row in table.rows:
+        cells = [_ranked(cell) for cell in row]
+        if groups and row[0] == previous:
             cells[0] = ""
+        elif groups and previous is not None:
+            text.append(r"\midrule")
         previous = row[0]
         text.append(" & ".join(cells) + r" \\")
     return "\n".join([*text, r"\bottomrule", r"\end{tabular}", ""])
 
 
-def _ranked(entry: Entry) -> str:
+def _ranked(cell: Cell) -> str:
     marks = ("{}", r"\textbf{{{}}}", r"\underline{{{}}}")
-    return marks[entry.rank].format(tex(entry.text))
+    return marks[cell.rank].format(tex(cell.text))
 
 
 _TEX = {
@@ -134,23 +250,6 @@ def tex(text: str) -> str:
     return "--" if escaped == "-" else re.sub(r"(?<![\w.-])-(?=\d)", "$-$", escaped)
 
 
-def table(header: Sequence[str], lines: Sequence[Sequence[str]], left: int = 2) -> str:
-    """Aligned columns of text: the first ``left`` to the left, the others to the right."""
-    columns = list(zip(header, *lines))
-    widths = [max(map(len, column)) for column in columns]
-
-    def aligned(cells: Sequence[str]) -> str:
-        padded = [
-            cell.ljust(width) if i < left else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(cells, widths))
-        ]
-        return "  ".join(padded).rstrip()
-
-    return "\n".join(
-        [aligned(header), aligned(["-" * width for width in widths])] + [*map(aligned, lines)]
-    )
-
-
 METRIC_LABELS = {
     "auc": "AUC",
     "dp20": "DP@20",
@@ -164,13 +263,3 @@ METRIC_LABELS = {
 def setting_label(latency: str, scale: float) -> str:
     """A latency and its scale, such as ``"recorded x 2"``."""
     return latency if scale == 1 else f"{latency} x {scale:g}"
-
-
-def p_label(p: float) -> str:
-    """A p value as text: ``"0.013"``, ``"<0.001"``, or ``"-"`` if it is NaN."""
-    return "<0.001" if p < 0.001 else number_text(p, "{:.3f}")
-
-
-def number_text(value: float, form: str) -> str:
-    """A number, or a dash for what is unknown."""
-    return "-" if np.isnan(value) else form.format(value)

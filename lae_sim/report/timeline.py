@@ -56,11 +56,12 @@ def timeline_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Itera
         )
     if any(costs.values()):
         raise LaeError(f"the picture {path} cannot show what forecasters cost: name a .json file")
-    from lae_sim.report import figures as plots
+    from lae_sim.report.figures import timeline
+    from lae_sim.report.style import save
 
     first: list[Run] = []
     yield lambda run: first.extend([] if first else [run])
-    plots.save(plots.timeline(first[0], sigma), path)
+    save(timeline(first[0], sigma), path)
 
 
 @contextmanager

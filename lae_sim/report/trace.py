@@ -7,13 +7,17 @@ import re
 import shutil
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.report.table import table
+from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
+from lae_sim.report.table import COUNT, Column, Number, Table, text_of
 from lae_sim.trace.describe import Report, gathered
 
 if TYPE_CHECKING:
+    from lae_sim.profile.passes import PassSummary
     from lae_sim.trace.describe import SequenceTimes
 
 _WIDTH, _INDENT, _BAR, _STALLS = 96, 13, 50, 10
@@ -104,12 +108,15 @@ def _readings(device: Any) -> list[str]:
     """Clocks, temperatures and load before, during and after; nothing where there are none."""
     # another program may have written anything there
     found = gathered(taken=lambda: dict(device["readings"])).get("taken", {})
-    rows = []
-    for name, figure in _FIGURES.items():
-        cells = [_range(found.get(when), figure) for when in ("before", "during", "after")]
-        rows += [[name, *cells]] if any(cells) else []
-    header = ["readings", "before", "during", "after"]
-    return ["", *table(header, rows, left=1).splitlines()] if rows else []
+
+    def reading(when: str) -> Column:
+        return Column(when, lambda row: _range(found.get(when), row[1]))
+
+    columns = [Column("readings", itemgetter(0), is_label=True)]
+    columns += map(reading, ("before", "during", "after"))
+    table = Table.of(columns, _FIGURES.items())
+    table = replace(table, rows=tuple(row for row in table.rows if any(c.text for c in row[1:])))
+    return ["", *text_of(table).splitlines()] if table.rows else []
 
 
 def _range(taken: Any, figure: Callable[[Any], float]) -> str:
@@ -122,21 +129,23 @@ def _range(taken: Any, figure: Callable[[Any], float]) -> str:
 
 def _times(times: Mapping[str, Any]) -> list[str]:
     names = ("mean_ms", "median_ms", "p90_ms", "p95_ms", "p99_ms", "max_ms", "fps")
-    rows = [
-        [kind, f"{found['n']:,}", *(_figure(found.get(name)) for name in names)]
-        for kind in ("calls", "initialisations")
-        if (found := times[kind])["n"]
+
+    def figure(name: str) -> Column:
+        return Column(name.removesuffix("_ms"), lambda kind: times[kind].get(name), _figure)
+
+    columns = [
+        Column("times, ms", str, is_label=True),
+        Column("n", lambda kind: times[kind]["n"], COUNT),
+        *map(figure, names),
     ]
-    header = ["times, ms", "n", *(name.removesuffix("_ms") for name in names)]
+    kinds = [kind for kind in ("calls", "initialisations") if times[kind]["n"]]
     share, interval = 100 * times["slower_than_frames"], _figure(times["frame_interval_ms"])
     late = f"{share:.3g}% of the calls take longer than the interval between frames, {interval} ms"
-    return [*table(header, rows, left=1).splitlines(), late]
+    return [*text_of(Table.of(columns, kinds)).splitlines(), late]
 
 
-def _figure(value: float | None) -> str:
+def _figure(value: float) -> str:
     """Three digits, or all before the point."""
-    if value is None:
-        return "-"
     return f"{value:,.{max(0, min(3, 2 - math.floor(math.log10(abs(value) or 1))))}f}"
 
 
@@ -181,18 +190,29 @@ def _stalls(stalls: list[dict[str, Any]]) -> list[str]:
     return [*lines, ""]
 
 
+def profile_table(passes: Sequence[PassSummary]) -> str:
+    """What a profile's passes left: a line per trace."""
+    columns = [Column("trace", attrgetter("trace"), is_label=True)]
+    counts = {"sequences": "sequences", "frames": "world_frames", "processed": "processed"}
+    columns += [
+        Column(title, attrgetter(key), COUNT) for title, key in {**counts, "lost": "lost"}.items()
+    ]
+    columns += [
+        Column(key.replace("_", " "), attrgetter(key), Number(".2f"))
+        for key in ("init_ms", "median_ms", "p95_ms")
+    ]
+    return text_of(Table.of(columns, passes))
+
+
+@styled
 def plot_times(found: Sequence[tuple[Report, Sequence[SequenceTimes]]], path: str) -> None:
     """Draw, for each trace, a histogram of its times, and the times over the run."""
-    from matplotlib.figure import Figure
-
-    from lae_sim.report import figures as plots
-
-    figure = Figure(figsize=(11, 3.6 * len(found)), layout="constrained")
+    figure = new_figure(11, 3.6 * len(found))
     rows = figure.subplots(len(found), 2, squeeze=False, width_ratios=(1, 2))
     for (left, right), (report, sequences) in zip(rows, found):
         times = report["times"]
         if histogram := times["histogram"]:
-            left.stairs(histogram["counts"], histogram["edges_ms"], fill=True)
+            left.stairs(histogram["counts"], histogram["edges_ms"], fill=True, color=BLUE)
             outside = histogram["below"] + histogram["above"]
             left.set_title(f"{outside:,} of {times['calls']['n']:,} calls are outside", fontsize=9)
             calls = times["calls"]
@@ -201,10 +221,10 @@ def plot_times(found: Sequence[tuple[Report, Sequence[SequenceTimes]]], path: st
         start = 0
         for number, sequence in enumerate(sequences):
             places = range(start, start := start + len(sequence.elapsed_ns))
-            ms, colour = sequence.elapsed_ns / 1e6, f"C{number % 2 * 9}"
+            ms, colour = sequence.elapsed_ns / 1e6, (BLUE, SKY_BLUE)[number % 2]
             right.plot(places, ms, ".", ms=1.5, color=colour, rasterized=True)
         order = "as they were run" if times["order_known"] else "in order of their names"
         right.set(xlabel=f"calls, sequences {order}", ylabel="time (ms)")
-        right.axhline(times["frame_interval_ms"], color="tab:red", ls="--", lw=1)
+        right.axhline(times["frame_interval_ms"], color=VERMILION, ls="--", lw=1)
         right.set_title(f"{report['trace']} (dashed: the interval between frames)", fontsize=9)
-    plots.save(figure, path)
+    save(figure, path)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate_groups
 from lae_sim.evaluation.metrics import find_convention
+from lae_sim.files import text_digest
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.study.cells import Cell, replayed
+from lae_sim.study.records import Requirement
 from lae_sim.trace.file import Trace, held, read_trace
 
 STEP = Fraction(1, 100)
@@ -44,8 +44,7 @@ class Search:
     @property
     def key(self) -> str:
         """Digest of all that the answer depends on."""
-        told = f"{self.cell.key} {self.required} {STEP} {MOST}"
-        return hashlib.sha256(told.encode()).hexdigest()[:32]
+        return text_digest(f"{self.cell.key} {self.required} {STEP} {MOST}")
 
 
 def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
@@ -63,16 +62,30 @@ def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
     ]
 
 
-def slowest(search: Search) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Slowest:
+    """The answer to a search.
+
+    Attributes:
+        auc_without_latency: the mean AUC at scale 0.
+        scale: the largest scale at which it is what is required, as text; None if there is none.
+        auc: the mean AUC there.
+        beyond: the hundredth after it, as text; None if the largest that is tried is enough.
+        beyond_auc: the mean AUC there.
+    """
+
+    auc_without_latency: float
+    scale: str | None = None
+    auc: float | None = None
+    beyond: str | None = None
+    beyond_auc: float | None = None
+
+
+def slowest(search: Search) -> Slowest:
     """The largest scale of all times at which the mean AUC is what is required.
 
-    Found by bisection over hundredths, as if the AUC fell with every step; the scale and the next
-    one are both replayed, so that what is told of these two is exact.
-
-    Returns:
-        ``scale`` and ``beyond``, the hundredth after it, as text, with their ``auc`` and
-        ``beyond_auc``; ``auc_without_latency``. ``scale`` is None if even without latency the AUC
-        is too low, ``beyond`` if it is enough at the largest scale that is tried.
+    By bisection over hundredths, as if the AUC fell with every step; the scale and the next one are
+    both replayed, so that what is said of these two is exact.
     """
     known: dict[int, float] = {}
     setting = search.cell.setting
@@ -83,22 +96,17 @@ def slowest(search: Search) -> dict[str, Any]:
             known[step] = mean_auc(search, step * STEP, trace)
         return known[step] >= search.required
 
-    found: dict[str, Any] = dict.fromkeys(("scale", "auc", "beyond", "beyond_auc"))
     if not enough(0):
-        found |= {"beyond": "0", "beyond_auc": known[0]}
-    else:
-        low, high = 0, 1
-        while enough(high) and high < MOST:
-            low, high = high, 2 * high
-        if enough(high):
-            low = high
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (middle, high) if enough(middle) else (low, middle)
-        found |= {"scale": str(low * STEP), "auc": known[low]}
-        if high > low:
-            found |= {"beyond": str(high * STEP), "beyond_auc": known[high]}
-    return {**found, "auc_without_latency": known[0]}
+        return Slowest(known[0], beyond="0", beyond_auc=known[0])
+    low, high = 0, 1
+    while enough(high) and high < MOST:
+        low, high = high, 2 * high
+    if enough(high):
+        return Slowest(known[0], str(high * STEP), known[high])
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    return Slowest(known[0], str(low * STEP), known[low], str(high * STEP), known[high])
 
 
 def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
@@ -119,27 +127,31 @@ def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
     return float(np.nanmean(scores))
 
 
-def requirement(search: Search, found: Mapping[str, Any]) -> dict[str, Any]:
-    """The answer as a row.
+def requirement(search: Search, answer: Slowest) -> Requirement:
+    """What the required AUC asks for.
 
     Where no time is absolute, as a cost or an expected time of a policy is, a schedule depends on
     processing times in frames alone: times scaled by f are a world that moves f times as fast, with
     the recorded motion from frame to frame (but for the rounding to whole ns).
     """
     setting = search.cell.setting
-    scale = None if found["scale"] is None else Fraction(found["scale"])
+    scale, beyond = (None if x is None else Fraction(x) for x in (answer.scale, answer.beyond))
     relative = search.cell.cost_ns == 0 and setting.policy.split(":")[0] in _RELATIVE
-    return {
-        "trace": setting.trace.label,
-        "times_from": (setting.timing or setting.trace).label,
-        "policy": setting.policy,
-        "fps": str(setting.fps),
-        "latency": setting.latency,
-        "convention": search.cell.setting.world.convention,
-        "forecaster": search.cell.forecaster,
-        "sigma": str(setting.world.sigmas[0]),
-        "required_auc": float(search.required),
-        **found,
-        "speed_up": None if not scale else float(1 / scale),
-        "fps_at_most": float(scale * setting.fps) if scale is not None and relative else None,
-    }
+    return Requirement(
+        trace=setting.trace.label,
+        times_from=(setting.timing or setting.trace).label,
+        policy=setting.policy,
+        fps=setting.fps,
+        latency=setting.latency,
+        convention=setting.world.convention,
+        forecaster=search.cell.forecaster,
+        sigma=setting.world.sigmas[0],
+        required_auc=float(search.required),
+        scale=scale,
+        auc=answer.auc,
+        beyond=beyond,
+        beyond_auc=answer.beyond_auc,
+        auc_without_latency=answer.auc_without_latency,
+        speed_up=None if not scale else float(1 / scale),
+        fps_at_most=float(scale * setting.fps) if scale is not None and relative else None,
+    )

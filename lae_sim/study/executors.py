@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager
 from itertools import islice
@@ -21,27 +21,44 @@ Item = TypeVar("Item")
 _GOES_ON = "what is finished is kept, and the same command goes on from there"
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def run_all(
-    work: Callable[[Item], Any],
-    items: Iterable[Item],
-    executor: Executor | None = None,
-    workers: Callable[[], int] = lambda: 1,
-) -> Iterator[tuple[Item, Any]]:
-    """Each item with what a function makes of it, as they are finished.
+    work: Callable[[Item], Any], items: Iterable[Item], workers: int, scheduler: str | None = None
+) -> Generator[tuple[Item, Any], None, None]:
+    """Each item with what a function makes of it, as they are finished; to be closed.
 
     Args:
         work: a function of a module, that workers can import.
         items: handed out as workers become free.
-        executor: where it runs; in this process if None.
-        workers: how many there are at the moment.
+        workers: processes on this machine; with one it runs in this process.
+        scheduler: address of a Dask cluster to run on instead.
 
     Raises:
-        LaeError: if a worker died, and nobody takes its place.
+        LaeError: if a worker died, and nobody takes its place; if there is no such cluster, or
+            Dask is not installed.
     """
-    if executor is None:
+    if scheduler is not None:
+        with _cluster(scheduler) as (executor, threads):
+            yield from _handed_out(work, items, executor, threads)
+    elif workers > 1:
+        with _processes(workers) as executor:
+            yield from _handed_out(work, items, executor, lambda: workers)
+    else:
         for item in items:
             yield item, work(item)
-        return
+
+
+def _handed_out(
+    work: Callable[[Item], Any],
+    items: Iterable[Item],
+    executor: Executor,
+    workers: Callable[[], int],
+) -> Iterator[tuple[Item, Any]]:
+    """Each item with what a function makes of it, by as many workers as there are at the moment."""
     waiting = iter(items)
     running: dict[Future[Any], Item] = {}
     try:
@@ -61,15 +78,15 @@ def run_all(
     except (LaeError, OSError):
         raise
     except Exception as error:  # whatever a cluster has to say: a worker lost too often, an import
-        told = " ".join(str(error).split())[:300]
-        raise LaeError(f"a worker failed, {type(error).__name__}: {told}; {_GOES_ON}") from error
+        message = " ".join(str(error).split())[:300]
+        raise LaeError(f"a worker failed, {type(error).__name__}: {message}; {_GOES_ON}") from error
     finally:
         for future in running:
             future.cancel()
 
 
 @contextmanager
-def local_executor(workers: int) -> Iterator[Executor]:
+def _processes(workers: int) -> Iterator[Executor]:
     """Worker processes on this machine."""
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
@@ -99,12 +116,8 @@ def _begin(parent: int) -> None:
 
 
 @contextmanager
-def cluster_executor(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """An existing Dask cluster, and how many threads it has at the moment.
-
-    Raises:
-        LaeError: if Dask is not installed, or there is no scheduler at the address.
-    """
+def _cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    """An existing Dask cluster, and how many threads it has at the moment."""
     try:
         from distributed import Client
     except ImportError as error:

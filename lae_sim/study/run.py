@@ -5,9 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -18,13 +17,14 @@ from lae_sim.errors import LaeError
 from lae_sim.files import written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.study.cells import Task
-from lae_sim.study.deployment import requirement, searches
-from lae_sim.study.executors import cluster_executor, local_executor, run_all
+from lae_sim.study.deployment import Slowest, requirement, searches
+from lae_sim.study.executors import cores, run_all
 from lae_sim.study.plan import Plan, make_plan, tasks
+from lae_sim.study.records import Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
 from lae_sim.study.store import Store
-from lae_sim.study.summary import Row, Scores, compare_traces, read_scores, summarise_study
-from lae_sim.study.work import Description, Failure, Work, attempt, cell_told, told
+from lae_sim.study.summary import Scores, compare_traces, read_scores, summarise_study
+from lae_sim.study.work import Description, Work, attempt
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class StudyResults:
-    """What a study found.
+    """The results of a study.
 
     Attributes:
         folder: where it is kept.
         plan: what was computed.
         scores: of every finished trace, setting, convention and forecaster.
-        summary: rows (see :func:`lae_sim.study.summary.summarise_study`).
+        summary: means (see :func:`lae_sim.study.summary.summarise_study`).
         comparisons: pairs of traces (see :func:`lae_sim.study.summary.compare_traces`).
         required: what a required AUC asks for (see :func:`lae_sim.study.deployment.requirement`).
-        traces: what ``lae-sim show --json`` says of each trace.
+        traces: what ``lae-sim show --json`` says of each trace, as it says it.
         computed: how many cells were computed now, and not found finished.
         failures: what could not be computed, and why.
         training: what to say of the forecasters that were trained.
@@ -50,12 +50,12 @@ class StudyResults:
     folder: Path
     plan: Plan
     scores: tuple[Scores, ...]
-    summary: tuple[Row, ...]
-    comparisons: tuple[Row, ...]
-    required: tuple[Row, ...]
-    traces: tuple[Row, ...]
+    summary: tuple[SummaryRow, ...]
+    comparisons: tuple[Comparison, ...]
+    required: tuple[Requirement, ...]
+    traces: tuple[dict[str, Any], ...]
     computed: int
-    failures: tuple[Row, ...]
+    failures: tuple[Failure, ...]
     training: tuple[str, ...] = ()
 
     def table(self) -> DataFrame:
@@ -68,22 +68,24 @@ class StudyResults:
 
     def notes(self) -> list[str]:
         """What keeps the figures from being what their names promise, each once."""
-        told = [note for scores in self.scores for about in scores.about for note in about["notes"]]
-        sources = [(source.input.label, source.metadata) for source in self.plan.sources]
-        times = [f"{label}: times: {about.timing_note}" for label, about in sources
-                 if about.timing_note]  # fmt: skip
-        warnings = [f"{trace['trace']}: {text}" for trace in self.traces
-                    for text in trace["warnings"]]  # fmt: skip
-        uneven = [f"{dataset}: its traces do not have the same sequences: compare no means"
-                  for dataset in self._uneven()]  # fmt: skip
-        return list(dict.fromkeys([*uneven, *times, *self.training, *told, *warnings]))
-
-    def _uneven(self) -> list[str]:
-        """Datasets of which some traces have other sequences than others."""
-        found: dict[str, set[tuple[str, ...]]] = {}
+        members: dict[str, set[tuple[str, ...]]] = {}
         for scores in self.scores:
-            found.setdefault(scores.source.metadata.dataset, set()).add(scores.sequences)
-        return [dataset for dataset, sequences in found.items() if len(sequences) > 1]
+            members.setdefault(scores.source.metadata.dataset, set()).add(scores.sequences)
+        notes = [
+            f"{dataset}: its traces do not have the same sequences: compare no means"
+            for dataset, sequences in members.items()
+            if len(sequences) > 1
+        ]
+        for source in self.plan.sources:
+            if source.metadata.timing_note:
+                notes.append(f"{source.input.label}: times: {source.metadata.timing_note}")
+        notes += self.training
+        notes += [
+            note for scores in self.scores for about in scores.about for note in about["notes"]
+        ]
+        for trace in self.traces:
+            notes += [f"{trace['trace']}: {text}" for text in trace["warnings"]]
+        return list(dict.fromkeys(notes))
 
     def document(self) -> dict[str, Any]:
         """All but the scores of single sequences, as ``study.json`` holds it."""
@@ -93,11 +95,11 @@ class StudyResults:
             "lae_sim": __version__,
             "study": self.plan.study.document(),
             "cells": len(self.plan.cells),
-            "failures": self.failures,
+            "failures": flat_rows(self.failures),
             "notes": self.notes(),
-            "summary": self.summary,
-            "comparisons": self.comparisons,
-            "required": self.required,
+            "summary": flat_rows(self.summary),
+            "comparisons": flat_rows(self.comparisons),
+            "required": flat_rows(self.required),
             "traces": self.traces,
         }
 
@@ -142,47 +144,48 @@ def _run(
     asked = [] if study.require_auc is None else searches(plan.cells, study.require_auc)
     described = [Description(source.input, study.sequences) for source in plan.sources]
     cells = [cell for cell in plan.cells if not store.has(cell)]
-    sought = [search for search in asked if store.found(search.key) is None]
+    sought = [search for search in asked if store.document(search.key) is None]
     needed = {*(cell.forecaster for cell in cells), *(each.cell.forecaster for each in sought)}
     factories, training = _factories(plan, needed, store, lambda what: progress(what, 0, 1))
     works: list[Work] = [
-        *(each for each in described if store.found(each.key) is None),
+        *(each for each in described if store.document(each.key) is None),
         *tasks(cells, factories),
         *(replace(search, factory=factories[search.cell.forecaster]) for search in sought),
     ]
     failures, computed = [], 0
-    count = min(workers or _cores(), max(len(works), 1))
-    with _executor(count, scheduler) as (executor, size):
-        for done, (work, result) in enumerate(run_all(attempt, works, executor, size)):
-            progress("", done + 1, len(works))
+    workers = min(workers or cores(), max(len(works), 1))
+    # closed whatever happens here, or workers would outlive the study
+    with closing(run_all(attempt, works, workers, scheduler)) as attempts:
+        for done, (work, result) in enumerate(attempts, 1):
+            progress("", done, len(works))
             if isinstance(result, Failure):
-                failures.append({"of": told(work), "reason": result.reason})
-            elif not isinstance(work, Task):
-                store.keep(work.key, result)
-            else:
-                for cell, found in result:
-                    if isinstance(found, Failure):
-                        failures.append({"of": cell_told(cell), "reason": found.reason})
+                failures.append(result)
+            elif isinstance(work, Task):
+                for of_cell in result:
+                    if isinstance(of_cell, Failure):
+                        failures.append(of_cell)
                     else:
-                        store.put(found)
+                        store.put(of_cell)
                         computed += 1
+            else:
+                store.keep(work.key, result)
     progress("summing up", len(works), len(works))
     scores = tuple(read_scores(plan, store))
     if not scores:
-        raise LaeError(f"nothing could be computed: {failures[0]['reason']}")
-    summary = tuple(summarise_study(scores, study.seed))
+        raise LaeError(f"nothing could be computed: {failures[0].reason}")
+    answers = ((search, store.document(search.key)) for search in asked)
     results = StudyResults(
         folder=store.folder,
         plan=plan,
         scores=scores,
-        summary=summary,
+        summary=tuple(summarise_study(scores, study.seed)),
         comparisons=tuple(compare_traces(scores, study.seed)),
         required=tuple(
-            requirement(search, found) for search in asked if (found := store.found(search.key))
+            requirement(search, Slowest(**answer)) for search, answer in answers if answer
         ),
-        traces=tuple(found for each in described if (found := store.found(each.key))),
+        traces=tuple(filter(None, (store.document(each.key) for each in described))),
         computed=computed,
-        failures=tuple(sorted(failures, key=str)),
+        failures=tuple(sorted(failures, key=lambda failure: str(failure.flat()))),
         training=tuple(training),
     )
     _write(results)
@@ -195,54 +198,41 @@ def _factories(
     """A factory for each forecaster needed, and what to say of training, now or before."""
     key = f"{plan.training}-training"
     if needed.isdisjoint(plan.trainers):
-        kept = {name: each for name, each in plan.forecasters.items() if name in needed}
-        told = store.found(key) if plan.trainers else None
-        return cast(dict[str, AnyFactory], kept), (told or {}).get("notes", [])
+        ready = {name: each for name, each in plan.forecasters.items() if name in needed}
+        before = store.document(key) if plan.trainers else None
+        return cast(dict[str, AnyFactory], ready), (before or {}).get("notes", [])
     factories, notes = plan.trained(progress)
     store.keep(key, {"notes": notes})
     return factories, notes
 
 
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextmanager
-def _executor(
-    workers: int, scheduler: str | None
-) -> Iterator[tuple[Executor | None, Callable[[], int]]]:
-    if scheduler is not None:
-        with cluster_executor(scheduler) as found:
-            yield found
-    elif workers == 1:
-        yield None, lambda: 1
-    else:
-        with local_executor(workers) as executor:
-            yield executor, lambda: workers
-
-
 def _write(results: StudyResults) -> None:
     """Write the summary, as CSV and JSON."""
-    tables = {
+    tables: dict[str, Sequence[Record]] = {
         "summary": results.summary,
         "comparisons": results.comparisons,
         "required": results.required,
     }
-    for name, rows in tables.items():
+    for name, records in tables.items():
         path = results.folder / f"{name}.csv"
-        if rows:
-            write_csv(rows, path)
+        if records:
+            write_csv(records, path)
         else:
             path.unlink(missing_ok=True)
     with written_whole(results.folder / "study.json") as temporary:
         temporary.write_text(json.dumps(results.document(), allow_nan=False))
 
 
-def write_csv(rows: Sequence[Row], path: Path) -> None:
-    """Write rows as CSV, whole or not at all; what is unknown is empty."""
+def write_csv(records: Sequence[Record], path: Path) -> None:
+    """Write records as CSV, whole or not at all; what is unknown is empty."""
+    rows = flat_rows(records)
     columns = list(dict.fromkeys(chain.from_iterable(rows)))
     with written_whole(path) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def flat_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
+    """Records as JSON and CSV hold them; for a table of pandas too."""
+    return [record.flat() for record in records]

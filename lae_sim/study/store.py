@@ -84,7 +84,7 @@ class Store:
         with written_whole(self.results / f"{result.key}.parquet") as temporary:
             temporary.write_bytes(result.rows)
 
-    def found(self, key: str) -> dict[str, Any] | None:
+    def document(self, key: str) -> dict[str, Any] | None:
         """A document that was kept under a key, if it was."""
         path = self._details(key)
         return self._read(path) if path.is_file() else None
@@ -108,10 +108,10 @@ class Store:
 
     def _read(self, path: Path) -> dict[str, Any]:
         try:
-            found: dict[str, Any] = json.loads(path.read_text())
+            document: dict[str, Any] = json.loads(path.read_text())
         except (OSError, ValueError) as error:
             raise LaeError(f"{path}: cannot be read: {error}; delete it") from error
-        return found
+        return document
 
     def _details(self, key: str) -> Path:
         return self._about / f"{key}.json"

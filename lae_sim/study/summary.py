@@ -1,8 +1,8 @@
 """The summary of a study: means with intervals, what latency costs, how stale answers are.
 
-Two things are uncertain, and told apart. *Sequences*: 95 % percentile bootstrap over them, of the
+Two things are uncertain, and kept apart. *Sequences*: 95 % percentile bootstrap over them, of the
 scores averaged over the repetitions; *jitter*: the range that holds 95 % of the repetitions' means,
-for these very sequences. Resamples depend on the seed and the number of sequences alone.
+for these very sequences.
 """
 
 from __future__ import annotations
@@ -15,23 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim._arrays import Floats
-from lae_sim.comparison.statistics import Counts, bootstrap_counts, resampled_means, signed_rank_p
+from lae_sim._arrays import Bools, Floats
+from lae_sim.comparison.statistics import RESAMPLES, Bootstrap, holm
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.cells import Cell, Setting
 from lae_sim.study.plan import Plan, Source
+from lae_sim.study.records import MEAN as MEAN
+from lae_sim.study.records import Comparison, Staleness, SummaryRow, Uncertainty
 from lae_sim.study.rows import COLUMNS, read_rows
 from lae_sim.study.store import Store
 from lae_sim.trace.columns import to_numpy
 
-RESAMPLES = 10_000
-MEAN = "mean"
-"""Stands for sigma where scores are plain means over all permitted latencies (mAUC, mDP)."""
-
-Row = dict[str, Any]
-_TAILS = (0.025, 0.975)
+Row = Mapping[str, Any]  # of tables that read records as flat rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +38,7 @@ class Scores:
     Attributes:
         source: the trace.
         setting: the first of the settings, which differ in their repetitions.
-        forecaster, convention: names.
+        forecaster: its name.
         sequences: names, S of them.
         means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``;
             of ``mismatch_max`` and ``longest_hold`` the largest (frames).
@@ -55,13 +52,17 @@ class Scores:
     source: Source
     setting: Setting
     forecaster: str
-    convention: str
     sequences: tuple[str, ...]
     means: Mapping[str, Floats]
     repeated: Mapping[str, Floats]
     over_sigmas: Mapping[str, Floats]
     once: Mapping[str, Floats]
     about: tuple[Mapping[str, Any], ...]
+
+    @property
+    def convention(self) -> str:
+        """How frames and thresholds count."""
+        return self.setting.world.convention
 
     @property
     def group(self) -> tuple[str, ...]:
@@ -76,6 +77,15 @@ class Scores:
             self.convention,
         )
 
+    @property
+    def identity(self) -> tuple[Any, ...]:
+        """What a forecaster and hold share: the group, the trace and where its times are from."""
+        return (self.setting.trace, self.setting.timing, *self.group)
+
+    def by_repetition(self, over_sigmas: bool) -> Mapping[str, Floats]:
+        """AUC and DP, float64 [R, S]: plain means over sigma, or at the first."""
+        return self.over_sigmas if over_sigmas else self.repeated
+
 
 _WORST = {"mismatch_max", "longest_hold"}
 _STALENESS = ("mismatch_mean", *sorted(_WORST))
@@ -86,10 +96,10 @@ _ONCE = ("world_frames", "processed", "elapsed_ms", *(f"offline_{m}" for m in ME
 def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
     """The finished cells of a study, in the order of the plan; one after another."""
     sources = {source.input: source for source in plan.sources}
-    together: dict[tuple[Any, ...], list[Cell]] = {}
+    together: dict[tuple[Setting, str], list[Cell]] = {}
     for cell in plan.cells:
         same = replace(cell.setting, first=0, count=1)
-        together.setdefault((same, cell.forecaster, cell.setting.world.convention), []).append(cell)
+        together.setdefault((same, cell.forecaster), []).append(cell)
     for cells in together.values():
         if all(store.has(cell) for cell in cells):
             yield _read(cells, sources[cells[0].setting.trace], store)
@@ -100,7 +110,7 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
     first = cells[0]
     count = len(first.setting.world.sigmas)
     numbers = [*METRICS, *_STALENESS]
-    found: dict[str, Any] = {}
+    totals: dict[str, Any] = {}
     repeated: dict[str, list[Floats]] = {name: [] for name in _REPEATED}
     over_sigmas: dict[str, list[Floats]] = {name: [] for name in ("auc", "dp20")}
     names: tuple[str, ...] = ()
@@ -113,11 +123,11 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
 
         entries = rows.num_rows // count
         sequences = rows.column("sequence").chunk(0)  # its take would import pyarrow.compute
-        told = [sequences[row].as_py() for row in range(0, rows.num_rows, count)]
-        names = tuple(sorted(set(told)))
+        of_entry = [sequences[row].as_py() for row in range(0, rows.num_rows, count)]
+        names = tuple(sorted(set(of_entry)))
         place = {name: s for s, name in enumerate(names)}
         order = np.lexsort((  # by repetition, then by sequence
-            np.array([place[name] for name in told]), column("repetition")[::count],
+            np.array([place[name] for name in of_entry]), column("repetition")[::count],
         ))  # fmt: skip
         shape = (cell.setting.count, len(names), count)
         for name in dict.fromkeys([*numbers, *_REPEATED, *_ONCE]):
@@ -128,29 +138,28 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
                 over_sigmas[name].append(values.mean(axis=2))
             values = values[:, :, 0] if name in _ONCE else values
             # one after another from the first repetition on, however they were dealt out
-            before = [found[name][None]] if name in found else []
+            before = [totals[name][None]] if name in totals else []
             combine = np.maximum if name in _WORST else np.add
-            found[name] = combine.reduce(np.concatenate([*before, values]))
+            totals[name] = combine.reduce(np.concatenate([*before, values]))
     count = sum(cell.setting.count for cell in cells)
-    for name in found.keys() - _WORST:
-        found[name] = found[name] / count
+    for name in totals.keys() - _WORST:
+        totals[name] = totals[name] / count
     return Scores(
         source=source,
         setting=first.setting,
         forecaster=first.forecaster,
-        convention=first.setting.world.convention,
         sequences=names,
-        means={name: found[name] for name in numbers},
+        means={name: totals[name] for name in numbers},
         repeated={name: np.concatenate(parts) for name, parts in repeated.items()},
         over_sigmas={name: np.concatenate(parts) for name, parts in over_sigmas.items()},
-        once={name: found[name] for name in _ONCE},
+        once={name: totals[name] for name in _ONCE},
         about=tuple(store.about(cell) for cell in cells),
     )
 
 
 def summarise_study(
     scores: Sequence[Scores], seed: int = 0, resamples: int = RESAMPLES
-) -> list[Row]:
+) -> list[SummaryRow]:
     """A row per trace, setting, convention, forecaster and sigma, and one of their means.
 
     Args:
@@ -159,169 +168,157 @@ def summarise_study(
         resamples: of the bootstrap.
 
     Returns:
-        Rows with the columns of the README; what is unknown is None. Intervals and tests stand in
-        the rows of the first sigma and of the mean over sigma.
+        Rows in the order of the scores. Intervals and tests stand in the rows of the first sigma
+        and of the mean over sigma.
     """
-    hold = {(*_identity(s),): s for s in scores if s.forecaster == "hold"}
-    counts: dict[int, Counts] = {}
-    rows: list[Row] = []
-    rivals: dict[tuple[Any, ...], list[Row]] = {}
+    bootstrap = Bootstrap(resamples, seed)
+    hold = {each.identity: each for each in scores if each.forecaster == "hold"}
+    rows: list[SummaryRow] = []
+    rivals: dict[tuple[Any, ...], list[int]] = {}
     for each in scores:
-        ours = [*_rows(each, hold.get(_identity(each)), seed, resamples, counts)]
-        for row in ours:
-            rival = (*each.group, each.sequences, each.forecaster, row["sigma"])
-            rivals.setdefault(rival, []).append(row)
-        rows += ours
-    for group in rivals.values():
-        _mark_front(group)
+        for row in _rows(each, hold.get(each.identity), bootstrap):
+            rival = (*each.group, each.sequences, each.forecaster, row.sigma)
+            rivals.setdefault(rival, []).append(len(rows))
+            rows.append(row)
+    for places in rivals.values():
+        for place in _front([rows[place] for place in places]):
+            rows[places[place]] = replace(rows[places[place]], pareto=True)
     return rows
 
 
-def _identity(scores: Scores) -> tuple[Any, ...]:
-    """What a forecaster and hold share."""
-    return (scores.setting.trace, scores.setting.timing, *scores.group)
-
-
-def _rows(
-    scores: Scores, hold: Scores | None, seed: int, resamples: int, counts: dict[int, Counts]
-) -> Iterator[Row]:
-    setting, metadata = scores.setting, scores.source.metadata
-    clock = Clock.at(setting.fps)
+def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator[SummaryRow]:
+    setting, metadata, sigmas = scores.setting, scores.source.metadata, scores.setting.world.sigmas
     departures = sum(about["approximate_outputs"] for about in scores.about)
     calls = sum(about["calls"] for about in scores.about)
-    told = {
-        "trace": setting.trace.label,
-        "tracker": metadata.tracker,
-        "dataset": metadata.dataset,
-        "device": metadata.device,
-        **setting.columns(),
-        "convention": scores.convention,
-        "forecaster": scores.forecaster,
-        "sequences": len(scores.sequences),
-        "repetitions": len(scores.repeated["auc"]),
-        "engine": scores.about[0]["engine"],
-        "exact": departures == 0,
-        "approximate_share": departures / calls if calls else 0.0,
-        "elapsed_ms": _mean(scores.once["elapsed_ms"]),
-        "skip_rate": float(1 - scores.once["processed"].sum() / scores.once["world_frames"].sum()),
-    }
-    offline = {f"offline_{m}": _mean(scores.once[f"offline_{m}"]) for m in METRICS}
     frames = scores.once["world_frames"]
-    for s, sigma in enumerate(setting.world.sigmas):
-        at = {metric: scores.means[metric][:, s] for metric in METRICS}
-        row: Row = {**told, "sigma": str(sigma), **{m: _mean(v) for m, v in at.items()}, **offline}
-        if s == 0:
-            row |= _uncertain(scores, hold, "repeated", seed, resamples, counts)
-        row |= _stale(scores, s, sigma, clock, frames)
-        yield row
-    if set(SIGMA_GRID) <= set(setting.world.sigmas):
-        grid = [s for s, sigma in enumerate(setting.world.sigmas) if sigma in SIGMA_GRID]
-        means = {m: _mean_of_means(scores.means[m][:, grid]) for m in METRICS}
-        row = {**told, "sigma": MEAN, **means, **offline}
-        if len(grid) == len(setting.world.sigmas):
-            row |= _uncertain(scores, hold, "over_sigmas", seed, resamples, counts)
-        yield row
+    row = SummaryRow(
+        trace=setting.trace.label,
+        tracker=metadata.tracker,
+        dataset=metadata.dataset,
+        device=metadata.device,
+        times_from=(setting.timing or setting.trace).label,
+        policy=setting.policy,
+        fps=setting.fps,
+        latency=setting.latency,
+        scale=setting.world.scale,
+        convention=scores.convention,
+        forecaster=scores.forecaster,
+        sequences=len(scores.sequences),
+        repetitions=len(scores.repeated["auc"]),
+        engine=scores.about[0]["engine"],
+        exact=departures == 0,
+        approximate_share=departures / calls if calls else 0.0,
+        elapsed_ms=_mean(scores.once["elapsed_ms"]),
+        skip_rate=float(1 - scores.once["processed"].sum() / frames.sum()),
+        sigma=MEAN,
+        scores={},
+        offline={metric: _mean(scores.once[f"offline_{metric}"]) for metric in METRICS},
+    )
+    for s, sigma in enumerate(sigmas):
+        yield replace(
+            row,
+            sigma=sigma,
+            scores={metric: _mean(scores.means[metric][:, s]) for metric in METRICS},
+            uncertainty=_uncertainty(scores, hold, bootstrap, over_sigmas=False) if s == 0 else {},
+            staleness=_staleness(scores, s),
+        )
+    if set(SIGMA_GRID) <= set(sigmas):
+        grid = [s for s, sigma in enumerate(sigmas) if sigma in SIGMA_GRID]
+        whole = len(grid) == len(sigmas)
+        yield replace(
+            row,
+            scores={metric: _mean_of_means(scores.means[metric][:, grid]) for metric in METRICS},
+            uncertainty=_uncertainty(scores, hold, bootstrap, over_sigmas=True) if whole else {},
+        )
 
 
-def _uncertain(
-    scores: Scores,
-    hold: Scores | None,
-    which: str,
-    seed: int,
-    resamples: int,
-    counts: dict[int, Counts],
-) -> Row:
-    """Intervals of the means, what is won over hold, and the share of the loss recovered."""
-    found: Row = {}
+def _uncertainty(
+    scores: Scores, hold: Scores | None, bootstrap: Bootstrap, over_sigmas: bool
+) -> dict[str, Uncertainty]:
+    """How sure mean AUC and DP are, and what is won over hold."""
+    uncertain = {}
     for metric in ("auc", "dp20"):
-        ours = getattr(scores, which)[metric]
-        base = None if hold is None or hold is scores else getattr(hold, which)[metric]
-        offline = scores.once[f"offline_{metric}"]
-        kept = ~np.isnan(ours.mean(axis=0))
+        values = scores.by_repetition(over_sigmas)[metric]
+        base = None if hold is None or hold is scores else hold.by_repetition(over_sigmas)[metric]
+        kept = ~np.isnan(values.mean(axis=0))
         if base is not None:
             kept &= ~np.isnan(base.mean(axis=0))
         if not kept.any():
             continue
-        count = int(kept.sum())
-        if count not in counts:
-            counts[count] = bootstrap_counts(count, resamples, seed)
-        mean = ours[:, kept].mean(axis=0)
-        bare = mean if base is None else base[:, kept].mean(axis=0)
-        rows = np.stack([mean, bare, offline[kept] - bare])
-        resampled, held, lost = resampled_means(rows, counts[count])
-        found[f"{metric}_low"], found[f"{metric}_high"] = ends(resampled)
-        if len(ours) > 1:
-            jitter = ends(ours[:, kept].mean(axis=1))
-            found[f"{metric}_jitter_low"], found[f"{metric}_jitter_high"] = jitter
+        mean = values[:, kept].mean(axis=0)
+        jitter = bootstrap.interval(values[:, kept].mean(axis=1)) if len(values) > 1 else None
         if base is None:
+            [means] = bootstrap.means(mean[None])
+            uncertain[metric] = Uncertainty(bootstrap.interval(means), jitter)
             continue
-        won = resampled - held
-        found[f"vs_hold_{metric}"] = float(mean.mean() - bare.mean())
-        found[f"vs_hold_{metric}_low"], found[f"vs_hold_{metric}_high"] = ends(won)
-        found[f"vs_hold_{metric}_p"] = signed_rank_p(np.round(mean - bare, 12))
-        if not np.isnan(offline[kept]).any():
-            loss = float(offline[kept].mean() - bare.mean())
-            if loss > 0:
-                found[f"recovered_{metric}"] = float(mean.mean() - bare.mean()) / loss
-            if (lost > 0).all():
-                shares = ends(won / lost)
-                found[f"recovered_{metric}_low"], found[f"recovered_{metric}_high"] = shares
-    return found
+        bare, offline = base[:, kept].mean(axis=0), scores.once[f"offline_{metric}"][kept]
+        means, held, losses = bootstrap.means(np.stack([mean, bare, offline - bare]))
+        difference, share = bootstrap.compare(mean, bare, means, held), None
+        if not np.isnan(offline).any():
+            lost = float(offline.mean() - bare.mean())
+            share = bootstrap.recover(difference.value, lost, means - held, losses)
+        uncertain[metric] = Uncertainty(bootstrap.interval(means), jitter, difference, share)
+    return uncertain
 
 
-def _stale(scores: Scores, s: int, sigma: Fraction, clock: Clock, frames: Floats) -> Row:
-    """How old answers are, and how long the target is held, in world time."""
+def _staleness(scores: Scores, s: int) -> Staleness:
+    """How old answers are, and how long the target is held, in world time, at one sigma."""
+    sigma, clock = scores.setting.world.sigmas[s], Clock.at(scores.setting.fps)
+    frames, frame_ms = scores.once["world_frames"], clock.milliseconds(1)
     mismatch = scores.means["mismatch_mean"][:, s] * frames
     mean = float(mismatch.sum() / frames.sum())
-    frame_ms = clock.milliseconds(1)
-    row = {
-        "mismatch_mean": mean,
-        "age_ms": (mean + float(sigma)) * frame_ms,
-        "age_max_ms": float(scores.means["mismatch_max"][:, s].max() + sigma) * frame_ms,
-        "longest_stale_ms": float(scores.means["longest_hold"][:, s].max()) * frame_ms,
-    }
+    staleness = Staleness(
+        mismatch_mean=mean,
+        age_ms=(mean + float(sigma)) * frame_ms,
+        age_max_ms=float(scores.means["mismatch_max"][:, s].max() + sigma) * frame_ms,
+        longest_stale_ms=float(scores.means["longest_hold"][:, s].max()) * frame_ms,
+    )
     if s:
-        return row
+        return staleness
     failure = scores.repeated["failure_frame"]
     failed = failure < frames
-    median = _median_survival(failure.ravel(), failed.ravel(), frame_ms)
-    return {**row, "failed": float(failed.mean()), "time_to_failure_ms": median}
+    median = _median_survival(failure.ravel(), failed.ravel())
+    return replace(
+        staleness,
+        failed=float(failed.mean()),
+        time_to_failure_ms=None if median is None else median * frame_ms,
+    )
 
 
-def _median_survival(times: Floats, failed: Any, frame_ms: float) -> float | None:
-    """Median time to failure, ms; None if less than half fail.
+def _median_survival(times: Floats, failed: Bools) -> float | None:
+    """Median time to failure, in the unit of the times; None if less than half fail.
 
     Sequences that end without failure are censored: the estimate is that of Kaplan and Meier,
-    "Nonparametric Estimation from Incomplete Observations", 1958.
+    "Nonparametric Estimation from Incomplete Observations", 1958. In exact numbers, for in floats
+    (as scipy.stats.ecdf has it) half of them may not be half.
     """
     alive = Fraction(1)
     for time in np.unique(times[failed]):
         lost = np.count_nonzero(failed & (times == time))
         alive *= 1 - Fraction(int(lost), int(np.count_nonzero(times >= time)))
         if alive <= Fraction(1, 2):
-            return float(time) * frame_ms
+            return float(time)
     return None
 
 
-def _mark_front(group: Sequence[Row]) -> None:
-    """Mark the Pareto front of rivals: no other has a higher AUC and faster calls.
+def _front(rivals: Sequence[SummaryRow]) -> list[int]:
+    """Those on the Pareto front of rivals: no other has a higher AUC and faster calls.
 
     Rivals are the traces with the same sequences, world, latency, convention, forecaster and sigma.
     """
-    known = [row for row in group if row["auc"] is not None and row["elapsed_ms"] is not None]
-    for row in group:
-        row["pareto"] = any(row is one for one in known) and not any(
-            other["auc"] >= row["auc"]
-            and other["elapsed_ms"] <= row["elapsed_ms"]
-            and (other["auc"], other["elapsed_ms"]) != (row["auc"], row["elapsed_ms"])
-            for other in known
+    known = [
+        (place, auc, row.elapsed_ms)
+        for place, row in enumerate(rivals)
+        if (auc := row.scores["auc"]) is not None and row.elapsed_ms is not None
+    ]
+    return [
+        place
+        for place, auc, ms in known
+        if not any(
+            other >= auc and others_ms <= ms and (other, others_ms) != (auc, ms)
+            for _, other, others_ms in known
         )
-
-
-def ends(samples: Floats) -> tuple[float, float]:
-    """The range of the middle 95 % of samples."""
-    low, high = np.quantile(samples, _TAILS).tolist()
-    return low, high
+    ]
 
 
 def _mean(values: Floats) -> float | None:
@@ -339,86 +336,79 @@ def _mean_of_means(values: Floats) -> float | None:
 
 def compare_traces(
     scores: Sequence[Scores], seed: int = 0, resamples: int = RESAMPLES
-) -> list[Row]:
+) -> list[Comparison]:
     """Traces of one dataset against each other: in every setting, with every forecaster.
 
     Returns:
-        A row per pair, at the first sigma (or, on the whole grid of sigmas, of the means over it):
-        ``difference`` of the mean AUC with its interval; ``p`` of Wilcoxon's signed-rank test over
-        the sequences, and ``p_holm``, corrected for the number of pairs of its group (Holm, "A
-        Simple Sequentially Rejective Multiple Test Procedure", 1979); ``better_here``, how probable
-        it is that one run of A beats one of B on these sequences (a tie counts half; None without
-        jitter), and ``better``, the same on other sequences like these (bootstrap, a repetition
-        drawn for each sequence).
+        A comparison per pair that has sequences in common, at the first sigma (or, on the whole
+        grid of sigmas, of the means over it); p-values are corrected (:func:`.statistics.holm`)
+        for the number of pairs of the same setting and forecaster.
     """
+    bootstrap = Bootstrap(resamples, seed)
     together: dict[tuple[str, ...], list[Scores]] = {}
     for each in scores:
         together.setdefault((*each.group, each.forecaster), []).append(each)
-    counts: dict[int, Counts] = {}
-    rows = []
+    comparisons = []
     for group in together.values():
-        ours = [_pair(a, b, seed, resamples, counts) for a, b in combinations(group, 2)]
-        known = [row for row in ours if row is not None]
-        previous = 0.0
-        for rank, row in enumerate(sorted(known, key=lambda row: row["p"])):
-            previous = row["p_holm"] = max(previous, min(1.0, row["p"] * (len(known) - rank)))
-        rows += known
-    return rows
+        pairs = [_pair(a, b, bootstrap) for a, b in combinations(group, 2)]
+        known = [pair for pair in pairs if pair is not None]
+        corrected = holm([pair.difference.p for pair in known])
+        comparisons += [replace(pair, p_holm=p) for pair, p in zip(known, corrected)]
+    return comparisons
 
 
-def _pair(a: Scores, b: Scores, seed: int, resamples: int, counts: dict[int, Counts]) -> Row | None:
+def _pair(a: Scores, b: Scores, bootstrap: Bootstrap) -> Comparison | None:
     """A against B; None if they have no sequences in common that count."""
-    whole = set(SIGMA_GRID) == set(a.setting.world.sigmas)
-    which = "over_sigmas" if whole else "repeated"
+    setting = a.setting
+    whole = set(SIGMA_GRID) == set(setting.world.sigmas)
     both = sorted(set(a.sequences) & set(b.sequences))
-    ours, theirs = (
-        getattr(one, which)["auc"][:, [one.sequences.index(name) for name in both]]
+    first, second = (
+        one.by_repetition(whole)["auc"][:, [one.sequences.index(name) for name in both]]
         for one in (a, b)
     )
-    kept = ~np.isnan(ours.mean(axis=0) + theirs.mean(axis=0))
+    kept = ~np.isnan(first.mean(axis=0) + second.mean(axis=0))
     if not kept.any():
         return None
-    ours, theirs = ours[:, kept], theirs[:, kept]
-    count = ours.shape[1]
-    if count not in counts:
-        counts[count] = bootstrap_counts(count, resamples, seed)
-    difference = ours.mean(axis=0) - theirs.mean(axis=0)
-    (margins,) = resampled_means(difference[None], counts[count])
-    low, high = ends(margins)
-    jitter = len(ours) > 1 or len(theirs) > 1
+    first, second = first[:, kept], second[:, kept]
+    differences = first.mean(axis=0) - second.mean(axis=0)
+    [margins] = bootstrap.means(differences[None])
+    difference = bootstrap.compare(differences, 0.0, margins, 0.0)
+    jitter = len(first) > 1 or len(second) > 1
     if jitter:
-        margins = _drawn_margins(ours, theirs, counts[count], seed)
-    here = np.sign(np.round(ours.mean(axis=1)[:, None] - theirs.mean(axis=1), 12))
-    setting = a.setting
-    return {
-        "dataset": a.source.metadata.dataset,
-        "policy": setting.policy,
-        "fps": str(setting.fps),
-        "latency": setting.latency,
-        "scale": str(setting.world.scale),
-        "convention": a.convention,
-        "forecaster": a.forecaster,
-        "sigma": MEAN if whole else str(setting.world.sigmas[0]),
-        "a": setting.run,
-        "b": b.setting.run,
-        "sequences": count,
-        "difference": float(difference.mean()),
-        "difference_low": low,
-        "difference_high": high,
-        "p": signed_rank_p(np.round(difference, 12)),
-        "better_here": float((here.mean() + 1) / 2) if jitter else None,
-        "better": float((np.sign(np.round(margins, 12)).mean() + 1) / 2),
-    }
+        margins = _drawn_margins(first, second, bootstrap)
+    here = first.mean(axis=1)[:, None] - second.mean(axis=1)
+    return Comparison(
+        dataset=a.source.metadata.dataset,
+        policy=setting.policy,
+        fps=setting.fps,
+        latency=setting.latency,
+        scale=setting.world.scale,
+        convention=a.convention,
+        forecaster=a.forecaster,
+        sigma=MEAN if whole else setting.world.sigmas[0],
+        a=setting.run,
+        b=b.setting.run,
+        sequences=len(differences),
+        difference=difference,
+        better_here=_superiority(here) if jitter else None,
+        better=_superiority(margins),
+    )
 
 
-def _drawn_margins(ours: Floats, theirs: Floats, counts: Counts, seed: int) -> Floats:
+def _superiority(margins: Floats) -> float:
+    """How probable a margin above 0 is; one of 0 counts half."""
+    return float((np.sign(np.round(margins, 12)).mean() + 1) / 2)
+
+
+def _drawn_margins(first: Floats, second: Floats, bootstrap: Bootstrap) -> Floats:
     """Differences in resamples of the sequences, each with a repetition drawn for each sequence."""
+    counts = bootstrap.counts(first.shape[1])
     resamples, count = counts.shape
-    random = np.random.Generator(np.random.PCG64([seed, count, len(ours), len(theirs)]))
+    random = np.random.Generator(np.random.PCG64([bootstrap.seed, count, len(first), len(second)]))
     margins = np.zeros(resamples)
     for s in range(count):  # one sequence after another: resamples x sequences would be large
-        run = ours[random.integers(0, len(ours), resamples), s]
+        run = first[random.integers(0, len(first), resamples), s]
         margins += (
-            counts[:, s] / count * (run - theirs[random.integers(0, len(theirs), resamples), s])
+            counts[:, s] / count * (run - second[random.integers(0, len(second), resamples), s])
         )
     return margins

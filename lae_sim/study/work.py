@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
 from lae_sim import __version__
 from lae_sim.errors import LaeError, explained
+from lae_sim.files import text_digest
 from lae_sim.study.cells import Cell, Input, Result, Setting, Task, compute
 from lae_sim.study.deployment import Search, slowest
+from lae_sim.study.records import Failure
 from lae_sim.trace.locate import digest, stamp
 
 
@@ -28,25 +29,17 @@ class Description:
     @property
     def key(self) -> str:
         """Digest of all that the description depends on."""
-        told = repr((__version__, self.trace.label, self.trace.digest, self.sequences))
-        return hashlib.sha256(told.encode()).hexdigest()[:32]
+        return text_digest(repr((__version__, self.trace.label, self.trace.digest, self.sequences)))
 
 
 Work: TypeAlias = Description | Task | Search
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Why something could not be computed, in a line or two."""
-
-    reason: str
 
 
 def attempt(work: Work) -> Any:
     """Do a piece of work, on some worker; what cannot be done is a :class:`Failure`.
 
     Returns:
-        Of a description or a search its document, of a task a pair of each cell and its result.
+        Of a description or a search its document, of a task the result or failure of each cell.
     """
     try:
         with explained("failed"):
@@ -55,14 +48,14 @@ def attempt(work: Work) -> Any:
                     raise LaeError(f"{trace.path}: changed since the study began: run it again")
             return _performed(work)
     except LaeError as error:
-        return Failure(str(error))
+        return Failure(work_in_words(work), str(error))
 
 
 def _performed(work: Work) -> Any:
     if isinstance(work, Task):
         return _cell_by_cell(work)
     if isinstance(work, Search):
-        return slowest(work)
+        return asdict(slowest(work))
     from lae_sim.trace.describe import describe
     from lae_sim.trace.file import read_trace
 
@@ -70,23 +63,22 @@ def _performed(work: Work) -> Any:
     return describe(trace, work.trace.label)[0]
 
 
-def _cell_by_cell(task: Task) -> list[tuple[Cell, Result | Failure]]:
+def _cell_by_cell(task: Task) -> list[Result | Failure]:
     """The cells together; where that fails, each alone, so that one does not cost the others."""
     try:
         with explained("failed"):
-            results = {result.key: result for result in compute(task)}
-            return [(cell, results[cell.key]) for cell in task.cells]
+            return list(compute(task))
     except LaeError as error:
         if len(task.cells) == 1:
-            return [(task.cells[0], Failure(str(error)))]
+            return [Failure(cell_in_words(task.cells[0]), str(error))]
     alone = [
         Task((cell,), {cell.forecaster: task.factories[cell.forecaster]}) for cell in task.cells
     ]
-    found = [each for one in alone for each in _cell_by_cell(one)]
-    reasons = {result.reason if isinstance(result, Failure) else "" for _, result in found}
+    results = [result for one in alone for result in _cell_by_cell(one)]
+    reasons = {result.reason if isinstance(result, Failure) else "" for result in results}
     if len(reasons) == 1 and reasons != {""}:
         raise LaeError(*reasons)  # it lies with the replay
-    return found
+    return results
 
 
 def _inputs(work: Work) -> list[Input]:
@@ -100,7 +92,7 @@ def _setting(work: Task | Search) -> Setting:
     return work.cells[0].setting if isinstance(work, Task) else work.cell.setting
 
 
-def told(work: Work) -> str:
+def work_in_words(work: Work) -> str:
     """What a piece of work is about, in words."""
     if isinstance(work, Description):
         return work.trace.label
@@ -117,6 +109,6 @@ def _in_words(setting: Setting, scale: bool = True) -> str:
     return f"{setting.run}, {setting.policy}, {setting.fps} fps, {setting.latency}{factor}"
 
 
-def cell_told(cell: Cell) -> str:
+def cell_in_words(cell: Cell) -> str:
     """What a cell is about, in words."""
     return f"{_in_words(cell.setting)}, {cell.forecaster}, {cell.setting.world.convention}"

@@ -22,7 +22,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
 from lae_sim.forecast.base import Hold
 from lae_sim.replay.run import replay_sequence
-from lae_sim.report.film import COLOURS, Scene
+from lae_sim.report.film import Scene, colours_of
 from lae_sim.trace.file import Trace, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
@@ -90,6 +90,7 @@ def has(picture: np.ndarray, x: float, colour: tuple[int, ...]) -> bool:
     return bool((np.abs(near - colour).max(axis=2) < 60).any(axis=1).all())
 
 
+COLOURS = (*colours_of(["hold", "kalman"]).values(),)
 ORANGE, WHITE = COLOURS[0], (255, 255, 255)
 
 

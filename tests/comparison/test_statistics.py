@@ -11,9 +11,18 @@ import pytest
 from scipy.stats import rankdata, wilcoxon
 from tidy_scores import random_scores, tidy
 
-from lae_sim.comparison.statistics import by_attribute, signed_rank_p, summarise
+from lae_sim.comparison.statistics import (
+    Bootstrap,
+    Interval,
+    Recovered,
+    by_attribute,
+    holm,
+    recovered,
+    signed_rank_p,
+    summarise,
+)
 from lae_sim.errors import LaeError
-from lae_sim.report.forecasters import comparison_table
+from lae_sim.report.comparison import comparison_table
 from lae_sim.report.table import p_label, setting_label
 
 KEYS = ["trace", "latency", "scale", "sigma", "forecaster", "metric"]
@@ -335,3 +344,49 @@ def test_labels():
     ]
     assert setting_label("recorded", 1) == "recorded"
     assert setting_label("constant:47ms", 0.5) == "constant:47ms x 0.5"
+
+
+def test_holm_by_hand():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_the_recovered_share_needs_a_loss_in_every_resample():
+    assert recovered(0.5, 2) == 0.25
+    assert recovered(-0.5, 2) == -0.25
+    assert recovered(0.5, 0) is None
+    assert recovered(0.5, -1) is None
+    bootstrap, wins = Bootstrap(), np.array([0.1, 0.2, 0.3])
+    found = bootstrap.recover(0.2, 0.4, wins, np.array([0.4, 0.4, 0.4]))
+    assert found.share == 0.5
+    assert found.interval == Interval(*np.quantile(wins / 0.4, [0.025, 0.975]))
+    assert bootstrap.recover(0.2, 0.4, wins, np.array([0.4, 0.0, 0.4])) == Recovered(0.5, None)
+    assert bootstrap.recover(0.2, 0.0, wins, np.zeros(3)) == Recovered(None, None)
+
+
+def test_resamples_are_drawn_once_and_depend_on_the_seed_and_their_number_alone():
+    bootstrap = Bootstrap(resamples=450, seed=4)
+    assert bootstrap.counts(7) is bootstrap.counts(7)
+    counts = np.random.Generator(np.random.PCG64(4)).multinomial(7, [1 / 7] * 7, size=450)
+    np.testing.assert_array_equal(bootstrap.counts(7), counts)
+    scores = np.random.default_rng(0).random((3, 7))
+    means = bootstrap.means(scores)
+    np.testing.assert_allclose(means, scores @ counts.T / 7, rtol=0, atol=1e-12)
+    for row, alone in zip(scores, means):
+        np.testing.assert_array_equal(bootstrap.means(row[None])[0], alone)
+
+
+def test_a_difference_is_paired():
+    bootstrap = Bootstrap(resamples=300)
+    values, baseline = np.array([0.5, 0.6, 0.7, 0.4]), np.array([0.4, 0.6, 0.5, 0.5])
+    means, others = bootstrap.means(np.stack([values, baseline]))
+    found = bootstrap.compare(values, baseline, means, others)
+    assert found.value == pytest.approx(0.05)
+    assert (found.better, found.worse) == (2, 1)
+    assert found.p == signed_rank_p(np.array([0.1, 0.2, -0.1]))
+    assert found.interval == bootstrap.interval(means - others)
+    [margins] = bootstrap.means((values - baseline)[None])
+    alike = bootstrap.compare(values - baseline, 0.0, margins, 0.0)
+    assert (alike.p, alike.better, alike.worse) == (found.p, found.better, found.worse)
+    assert alike.interval.low == pytest.approx(found.interval.low, abs=1e-12)

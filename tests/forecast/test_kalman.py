@@ -132,8 +132,8 @@ def test_a_restart_needs_an_iou_strictly_below_0_3() -> None:
     for shift, restarts in ((7, False), (7.0625, True)):
         boxes = np.array([[0, 0, 10, 13], [0, shift, 10, 13]], float)
         lanes = Lanes(np.array([0, 2]), np.array([0, 1]), boxes, np.full((1, 2), np.inf))
-        _, velocity = filter_lanes(lanes, np.array([1]), PAPER, RESTART_IOU)
-        assert (velocity == 0).all() == restarts
+        states, place = filter_lanes(lanes, PAPER, RESTART_IOU)
+        assert (states[place[1], 1] == 0).all() == restarts
     for wanted, restarts in ((0.29, True), (0.31, False)):
         model = KalmanLaePvt([0, 0, 100, 100])
         model.update(1, iou_case(wanted))
@@ -200,16 +200,14 @@ def test_lanes_of_any_order_of_lengths_do_not_mix() -> None:
     offsets = np.cumsum([0, *lengths])
     frames = np.concatenate([np.arange(n) * 2 for n in lengths])
     boxes = random.uniform(10, 60, (offsets[-1], 4))
-    together = filter_lanes(
-        Lanes(offsets, frames, boxes, np.full((6, 2), np.inf)), np.arange(offsets[-1])
-    )
+    states, place = filter_lanes(Lanes(offsets, frames, boxes, np.full((6, 2), np.inf)))
+    assert sorted(place) == list(range(offsets[-1]))
     for low, high in pairwise(offsets):
         part = Lanes(
             np.array([0, high - low]), frames[low:high], boxes[low:high], np.full((1, 2), np.inf)
         )
-        alone = filter_lanes(part, np.arange(high - low))
-        for one, all_ in zip(alone, together):
-            assert one.tobytes() == all_[:, low:high].tobytes()
+        alone, in_order = filter_lanes(part)
+        assert alone[in_order].tobytes() == states[place[low:high]].tobytes()
 
 
 # -------------------------------------------------------------------------- its family, TunedKalman

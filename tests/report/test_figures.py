@@ -7,8 +7,14 @@ from places import TRACES
 
 import lae_sim
 from lae_sim.report import figures as plots
+from lae_sim.report.style import save
 
 FORECASTERS = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
+
+
+def curves_of(trace):
+    evaluation = lae_sim.evaluate(lae_sim.replay_trace(trace), trace.metadata, FORECASTERS)
+    return plots.mean_curves(evaluation, FORECASTERS)
 
 
 @pytest.fixture
@@ -18,8 +24,8 @@ def trace():
 
 def test_curves_average_to_the_scores(trace):
     runs = list(lae_sim.replay_trace(trace))
-    curves = plots.curves(runs, trace.metadata, FORECASTERS, Fraction(1, 2))
     found = lae_sim.evaluate(runs, trace.metadata, FORECASTERS, [Fraction(1, 2)])
+    curves = plots.mean_curves(found, FORECASTERS)
     assert list(curves) == ["offline", "hold", "kalman"]
     assert curves["offline"][0].mean() == pytest.approx(found.offline["auc"].mean())
     for f, name in enumerate(FORECASTERS):
@@ -30,17 +36,18 @@ def test_curves_average_to_the_scores(trace):
 
 def test_a_real_time_trace_has_no_offline_curve():
     trace = lae_sim.read_trace(TRACES / "synthetic-slow-realtime.parquet")
-    curves = plots.curves(lae_sim.replay_trace(trace), trace.metadata, FORECASTERS)
+    curves = curves_of(trace)
     assert list(curves) == ["hold", "kalman"]
 
 
 def test_success_and_precision_draws_a_line_for_each_curve(trace):
-    curves = plots.curves(lae_sim.replay_trace(trace), trace.metadata, FORECASTERS)
+    curves = curves_of(trace)
     figure = plots.success_and_precision(curves, "title")
     left, right = figure.axes
     assert [len(axes.lines) for axes in (left, right)] == [3, 3]
     np.testing.assert_array_equal(left.lines[2].get_ydata(), curves["kalman"][0])
-    assert right.get_legend().get_texts()[1].get_text().startswith("hold [")
+    [legend] = figure.legends
+    assert legend.get_texts()[1].get_text().startswith("hold [")
 
 
 def test_timeline_shows_frames_and_who_answers_them(trace):
@@ -58,12 +65,12 @@ def test_timeline_shows_frames_and_who_answers_them(trace):
 
 
 def test_saving_says_which_endings_there_are(trace, tmp_path):
-    curves = plots.curves(lae_sim.replay_trace(trace), trace.metadata, FORECASTERS)
+    curves = curves_of(trace)
     figure = plots.success_and_precision(curves)
-    plots.save(figure, str(tmp_path / "a.svg"))
+    save(figure, str(tmp_path / "a.svg"))
     assert (tmp_path / "a.svg").read_text().startswith("<?xml")
     with pytest.raises(lae_sim.LaeError, match=r"name a \.png"):
-        plots.save(figure, str(tmp_path / "a.docx"))
+        save(figure, str(tmp_path / "a.docx"))
 
 
 @pytest.mark.parametrize("name", ["otb", "exclude", "got10k"])
@@ -77,12 +84,10 @@ def test_curves_leave_out_the_sequences_that_the_scores_do(name):
     ]
     trace = lae_sim.Trace(lae_sim.Metadata.new("30", "every-frame"), recordings)
     convention = lae_sim.CONVENTIONS[name]
-    curves = plots.curves(
-        lae_sim.replay_trace(trace), trace.metadata, FORECASTERS, convention=convention
-    )
     found = lae_sim.evaluate(
         lae_sim.replay_trace(trace), trace.metadata, FORECASTERS, convention=convention
     )
+    curves = plots.mean_curves(found, FORECASTERS)
     for f, forecaster in enumerate(FORECASTERS):
         success, precision = curves[forecaster]
         assert success.mean() == pytest.approx(np.nanmean(found.scores["auc"][f]))

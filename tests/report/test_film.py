@@ -10,7 +10,7 @@ pytest.importorskip("cv2", reason="drawing needs OpenCV")
 import cv2
 
 from lae_sim.errors import LaeError
-from lae_sim.report.film import COLOURS, WHITE, draw_frame, film_strip
+from lae_sim.report.film import WHITE, colours_of, draw_frame, film_strip
 
 NONE = [np.nan] * 4
 
@@ -29,6 +29,10 @@ def texts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return written
 
 
+HOLD, KALMAN = colours_of(["hold", "kalman"]).values()
+OTHER = colours_of(["a"])["a"]
+
+
 def grey(height: int = 360, width: int = 640) -> np.ndarray:
     return np.full((height, width, 3), 90, np.uint8)
 
@@ -41,9 +45,9 @@ def test_each_box_has_its_colour_and_place() -> None:
     assert picture.dtype == np.uint8
     assert picture.shape[1] == 640
     assert picture.shape[0] > 360
-    for x, y, colour in [(300, 80, COLOURS[0]), (380, 80, COLOURS[0]), (340, 100, COLOURS[0])]:
+    for x, y, colour in [(300, 80, HOLD), (380, 80, HOLD), (340, 100, HOLD)]:
         assert tuple(picture[y, x]) == colour
-    assert tuple(picture[235, 30]) == COLOURS[1]
+    assert tuple(picture[235, 30]) == KALMAN
     assert tuple(picture[125, 160]) == WHITE
     assert (picture[:360][70:90, 310:370] == 90).all()  # nothing inside a box
     drawn = (picture[:360] != 90).any(axis=2)
@@ -53,18 +57,18 @@ def test_each_box_has_its_colour_and_place() -> None:
 def test_small_frames_are_enlarged_with_their_boxes() -> None:
     picture = draw_frame(grey(90, 160), {"a": (20, 30, 40, 20)})
     assert picture.shape[1] == 640
-    assert tuple(picture[160, 80]) == COLOURS[0]  # x 20 and the middle of y, four times as large
-    assert tuple(picture[200, 160]) == COLOURS[0]
+    assert tuple(picture[160, 80]) == OTHER  # x 20 and the middle of y, four times as large
+    assert tuple(picture[200, 160]) == OTHER
     narrow = draw_frame(grey(1080, 1920), {"a": (300, 300, 600, 300)}, width=640)
     assert narrow.shape[1] == 640
-    assert tuple(narrow[150, 100]) == COLOURS[0]
+    assert tuple(narrow[150, 100]) == OTHER
 
 
 def test_lines_and_letters_grow_with_the_frame() -> None:
     def thickness(width: int) -> int:
         image = grey(width * 9 // 16, width)
         row = draw_frame(image, {"a": (width // 4, 0, width // 2, width // 2)})[width // 8]
-        return int((row[: width // 2] == COLOURS[0]).all(axis=1).sum())
+        return int((row[: width // 2] == OTHER).all(axis=1).sum())
 
     assert [thickness(width) for width in (640, 1280, 3840)] == [3, 5, 13]
     bands = [

@@ -16,9 +16,8 @@ import pytest
 from nasty import NASTY, nasty_traces
 
 from lae_sim.evaluation.metrics import CONVENTIONS
-from lae_sim.report import page as study_report
 from lae_sim.report import study_figures
-from lae_sim.report.page import page, told_convention, write_report
+from lae_sim.report.page import convention_in_words, page, page_file, write_report
 from lae_sim.report.study_view import View
 from lae_sim.study.run import run_study
 from lae_sim.study.spec import Study
@@ -146,9 +145,9 @@ def test_a_study_of_one_trace_and_hold_alone_is_the_same_bytes_twice(tmp_path):
 
 
 def test_conventions_are_told_apart():
-    told = {told_convention(convention) for convention in CONVENTIONS.values()}
+    told = {convention_in_words(convention) for convention in CONVENTIONS.values()}
     assert len(told) == len(CONVENTIONS)
-    assert "0.952" in told_convention(CONVENTIONS["pysot"])
+    assert "0.952" in convention_in_words(CONVENTIONS["pysot"])
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
@@ -161,7 +160,7 @@ def test_conventions_are_told_apart():
     ],
 )
 def test_sorting(values, descending, order):
-    code = f"{study_report._SCRIPT}\nconsole.log(JSON.stringify(order({json.dumps(values)}, "
-    code += f"{json.dumps(descending)})))"
+    call = f"order({json.dumps(values)}, {json.dumps(descending)})"
+    code = f"{page_file('page.js')}\nconsole.log(JSON.stringify({call}))"
     done = subprocess.run(["node", "-e", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == order

@@ -16,7 +16,7 @@ from lae_sim.report.study_tables import (
     write_tables,
 )
 from lae_sim.report.study_view import View
-from lae_sim.report.table import Entry, Table, latex, tex
+from lae_sim.report.table import Cell, Column, Table, latex_of, tex
 from lae_sim.study.run import StudyResults, run_study
 from lae_sim.study.spec import Study
 
@@ -48,7 +48,7 @@ def test_ranking_says_what_the_summary_says(results):
     for row in results.summary:
         ours = found[row["scale"], row["trace"], row["forecaster"]]
         assert ours["AUC"].value == row["auc"]
-        assert ours["AUC"].ends == (row["auc_low"], row["auc_high"])
+        assert ours["AUC"].interval == (row["auc_low"], row["auc_high"])
         assert ours["change"].value == pytest.approx(row["auc"] / row["offline_auc"] - 1)
         assert ours["age ms"].value == row["age_ms"]
         assert ours["front"].value == row["pareto"]
@@ -102,12 +102,17 @@ def test_files(results, tmp_path):
 
 def test_golden_latex():
     rows = (
-        (Entry("A_1", "A_1"), Entry("hold", "hold"), Entry("0.512", 0.512, rank=2)),
-        (Entry("A_1", "A_1"), Entry("kalman", "kalman"), Entry("-0.6%", -0.6, rank=1)),
-        (Entry("B", "B"), Entry("hold", "hold"), Entry("-", None)),
+        (Cell("A_1", "A_1"), Cell("hold", "hold"), Cell("0.512", 0.512, rank=2)),
+        (Cell("A_1", "A_1"), Cell("kalman", "kalman"), Cell("-0.6%", -0.6, rank=1)),
+        (Cell("B", "B"), Cell("hold", "hold"), Cell("-", None)),
     )
-    table = Table("t", "What 50% is", ("tracker", "f", "Δ"), rows, 2, (("D&D", 1),))
-    assert latex(table) == "\n".join([
+    columns = (
+        Column("tracker", str, is_label=True),
+        Column("f", str, is_label=True),
+        Column("Δ", str, group="D&D"),
+    )
+    table = Table("t", "What 50% is", columns, rows)
+    assert latex_of(table) == "\n".join([
         "% What 50% is",
         r"% \usepackage{booktabs}; if it is too wide: \usepackage{adjustbox} and",
         r"% \adjustbox{max width=\linewidth}{\input{t}}",

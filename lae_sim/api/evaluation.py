@@ -1,0 +1,510 @@
+"""Replaying and scoring traces in one call."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lae_sim.api.inputs import Forecasters, Progress, forecaster_names, labelled_traces
+from lae_sim.boxes import iou
+from lae_sim.engine.clock import Number, exact
+from lae_sim.engine.scheduler import Policy
+from lae_sim.errors import LaeError
+from lae_sim.evaluation.caveats import SkippedStalls, notes_on
+from lae_sim.evaluation.evaluate import Evaluation, answers
+from lae_sim.evaluation.evaluate import evaluate as evaluate_runs
+from lae_sim.evaluation.metrics import METRICS, find_convention
+from lae_sim.forecast.base import AnyFactory
+from lae_sim.forecast.costs import cost_notes, resolve_costs
+from lae_sim.learning.registry import find_camera, load_forecaster
+from lae_sim.replay.latency import LatencySource
+from lae_sim.replay.run import Run, Runs
+from lae_sim.replay.world import TraceLike, World, label_of
+from lae_sim.report import figures
+from lae_sim.report.replay import attribute_members, trace_report
+from lae_sim.trace.file import Trace
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """One trace in one world, with the forecasters that are scored there.
+
+    Attributes:
+        label: the trace's name in tables and pictures.
+        trace: the trace.
+        world: how it is replayed and scored.
+        runs: its sequences, replayed anew each time one goes through them.
+        forecasters: factories by name; hold, the baseline of all comparisons, is always there.
+        costs: what an answer of each forecaster costs, ns; 0 if not named.
+    """
+
+    label: str
+    trace: Trace
+    world: World
+    runs: Runs
+    forecasters: Mapping[str, AnyFactory]
+    costs: Mapping[str, int]
+
+    def evaluate(
+        self,
+        observers: Sequence[Callable[[Run], None]] = (),
+        advance: Callable[[int, str], None] = lambda frames, what: None,
+    ) -> Evaluated:
+        """Replay and score.
+
+        Args:
+            observers: each is given every run as it passes.
+            advance: told of the world frames of each run.
+        """
+        metadata, convention = self.trace.metadata, find_convention(self.world.convention)
+        stalls = SkippedStalls()
+        if self.world.latency == "recorded" and self.world.timing is None:
+            observers = [*observers, stalls]
+
+        def observed() -> Iterator[Run]:
+            for run in self.runs:
+                for observe in observers:
+                    observe(run)
+                yield run
+                advance(len(run), "")
+
+        evaluation = evaluate_runs(
+            observed(), metadata, self.forecasters, self.world.sigmas, convention, self.costs
+        )
+        notes = notes_on(evaluation, metadata, convention, self.forecasters)
+        return Evaluated(self, evaluation, (*notes, *stalls.notes(), *cost_notes(self.costs)))
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """The scores of a scenario.
+
+    Attributes:
+        scenario: what was replayed and scored.
+        evaluation: its scores.
+        notes: what keeps the scores from being what they seem, a sentence each.
+    """
+
+    scenario: Scenario
+    evaluation: Evaluation
+    notes: tuple[str, ...]
+
+    def document(self, attributes: bool = False, per_sequence: bool = False) -> dict[str, Any]:
+        """The scores as a JSON object, as ``lae-sim replay --json`` has them."""
+        scenario, world = self.scenario, self.scenario.world
+        metadata, runs = scenario.trace.metadata, scenario.runs
+        path = path_of(scenario.trace, scenario.label)
+        times = runs.trace if runs.timing is None else runs.timing
+        members = attribute_members(metadata, self.evaluation.sequences) if attributes else None
+        return {
+            "trace": path,
+            "tracker": metadata.tracker,
+            "dataset": metadata.dataset,
+            "device": metadata.device,
+            "strided": [path_of(trace, "open trace") for trace in runs.passes],
+            "times_from": path if runs.timing is None else path_of(runs.timing, "open trace"),
+            "times_note": times.metadata.timing_note,
+            "fps": str(runs.clock.fps),
+            "policy": label_of(world.policy),
+            "latency": label_of(world.latency),
+            "latency_scale": str(world.scale),
+            "convention": world.convention,
+            "forecaster_cost_ns": dict(scenario.costs),
+            "notes": list(self.notes),
+            **trace_report(
+                self.evaluation,
+                runs.clock,
+                list(scenario.forecasters),
+                world.sigmas,
+                world.convention,
+                members,
+                per_sequence,
+            ),
+        }
+
+
+def path_of(trace: Trace, otherwise: str) -> str:
+    """The path or URL that a trace was read from; something else if from none."""
+    return str(getattr(trace.recordings, "path", otherwise))
+
+
+def scenarios(
+    traces: Mapping[str, Trace],
+    worlds: Sequence[World],
+    *,
+    factories: Mapping[str, AnyFactory] | None = None,
+    sequences: Iterable[str] | None = None,
+    root: str | os.PathLike[str] | None = None,
+    dataset: str | None = None,
+    camera_lag: int | None = None,
+) -> list[Scenario]:
+    """Each trace in each world; what names stand for is found here, before any work.
+
+    Args:
+        traces: traces by name.
+        worlds: how they are replayed and scored.
+        factories: forecasters of the worlds that are not found by their names.
+        sequences: those of the traces, if not all, to read of passes too.
+        root, dataset, camera_lag: see :func:`lae_sim.learning.registry.find_camera`.
+
+    Raises:
+        LaeError: if there is no such convention, forecaster, or trace of times or passes.
+    """
+    found = []
+    folder = None if root is None else os.fspath(root)
+    names = None if sequences is None else list(sequences)
+    for label, trace in traces.items():
+        costs: dict[str, int] | None = None
+        for world in worlds:
+            find_convention(world.convention)
+            runs = world.replay(trace, names)
+            camera = find_camera(folder, dataset, names, runs.clock.fps, camera_lag)
+            forecasters = {
+                name: (factories or {}).get(name) or load_forecaster(name, camera)
+                for name in dict.fromkeys(["hold", *world.forecasters])
+            }
+            if costs is None:  # measured once: a sweep is of nothing else
+                costs = resolve_costs(world.costs, forecasters, trace)
+            found.append(Scenario(label, trace, world, runs, forecasters, costs))
+    return found
+
+
+SETTING = ("trace", "tracker", "dataset", "policy", "fps", "latency", "scale", "convention")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class EvaluationResult:
+    """What :func:`evaluate` found.
+
+    Attributes:
+        parts: one per trace and world.
+    """
+
+    parts: tuple[Evaluated, ...]
+
+    @cached_property
+    def summary(self) -> DataFrame:
+        """Mean scores: a row per trace, world, forecaster and permitted latency.
+
+        Columns: what the row is of (:data:`SETTING`, forecaster, sigma), the number of sequences,
+        the scores and offline scores in 0..1, the share of the latency loss ``recovered`` (NaN if
+        unknown), ``mismatch_mean`` in frames, ``age_ms``, ``skip_rate``, and ``exact``: whether
+        every output follows the frame that it followed when it was recorded.
+        """
+        import pandas as pd
+
+        rows = []
+        for part in self.parts:
+            document = part.document()
+            offline = document["offline"] or dict.fromkeys(METRICS)
+            for result in document["results"]:
+                rows.append(
+                    {
+                        **_setting(part.scenario),
+                        "forecaster": result["forecaster"],
+                        "sigma": result["sigma"],
+                        "sequences": document["sequences"],
+                        **{metric: result[metric] for metric in METRICS},
+                        **{f"offline_{metric}": offline[metric] for metric in METRICS},
+                        "recovered_auc": result["recovered_auc"],
+                        "recovered_dp20": result["recovered_dp20"],
+                        "mismatch_mean": result["mismatch_mean"],
+                        "age_ms": result["age_ms"],
+                        "skip_rate": document["skip_rate"],
+                        "exact": document["exact"],
+                    }
+                )
+        numbers = [f"{place}{metric}" for place in ("", "offline_") for metric in METRICS]
+        numbers += ["recovered_auc", "recovered_dp20"]
+        return pd.DataFrame(rows).astype(dict.fromkeys(numbers, "float64"))
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """What keeps the scores from being what they seem, each once."""
+        several = len({part.scenario.label for part in self.parts}) > 1
+        notes = [
+            (f"{part.scenario.label}: " if several else "") + note
+            for part in self.parts
+            for note in (*part.notes, *_exactness(part))
+        ]
+        return list(dict.fromkeys(notes))
+
+    def to_frame(self) -> DataFrame:
+        """Every score: a row per trace, world, sequence, forecaster and permitted latency.
+
+        Columns: :data:`SETTING`, sequence, forecaster, sigma; the scores and offline scores in
+        0..1 (NaN where the sequence leaves the mean); ``world_frames``, ``processed`` and
+        ``approximate_outputs``; ``mismatch_mean`` in frames.
+        """
+        import pandas as pd
+
+        tables = []
+        for part in self.parts:
+            evaluation, world = part.evaluation, part.scenario.world
+            axes = [
+                list(part.scenario.forecasters),
+                evaluation.sequences,
+                [float(sigma) for sigma in world.sigmas],
+            ]
+            index = pd.MultiIndex.from_product(axes, names=["forecaster", "sequence", "sigma"])
+            shape = tuple(map(len, axes))
+
+            def spread(values: Any, shape: tuple[int, ...] = shape) -> Any:
+                return np.broadcast_to(values, shape).ravel()
+
+            frames = evaluation.frames[:, None]
+            columns = {metric: evaluation.scores[metric].ravel() for metric in METRICS}
+            for metric in METRICS:
+                columns[f"offline_{metric}"] = spread(evaluation.offline[metric][:, None])
+            columns["world_frames"] = spread(frames)
+            columns["processed"] = spread(evaluation.processed[:, None])
+            columns["approximate_outputs"] = spread(evaluation.departures[:, None])
+            columns["mismatch_mean"] = spread(evaluation.mismatch_sum / frames)
+            table = pd.DataFrame(columns, index).reset_index()
+            tables.append(table.assign(**_setting(part.scenario)))
+        joined = pd.concat(tables, ignore_index=True)
+        first = [*SETTING, "sequence", "forecaster", "sigma"]
+        return joined[[*first, *joined.columns.difference(first, sort=False)]]
+
+    def answers(
+        self,
+        sequence: str,
+        forecaster: str,
+        *,
+        trace: str | None = None,
+        sigma: Number | None = None,
+    ) -> DataFrame:
+        """What a forecaster answered for every world frame of a sequence.
+
+        Args:
+            sequence: its name.
+            forecaster: its name.
+            trace: the trace's name, if there are several; of several worlds the first is taken.
+            sigma: the permitted latency; the first by default.
+
+        Returns:
+            A row per world frame: ``frame``; the answer ``x, y, w, h`` in pixels; ``source_frame``,
+            the frame of the output that it comes from; the truth ``truth_x`` to ``truth_h``; the
+            ``iou`` of the two.
+
+        Raises:
+            LaeError: if there is no such trace, sequence, forecaster or permitted latency.
+        """
+        import pandas as pd
+
+        scenario = self._scenario(trace)
+        if forecaster not in scenario.forecasters:
+            raise LaeError(
+                f"forecaster: no {forecaster!r} here: there are {', '.join(scenario.forecasters)}"
+            )
+        chosen = scenario.world.sigmas[0] if sigma is None else exact(sigma)
+        if chosen not in scenario.world.sigmas:
+            raise LaeError(f"sigma: {chosen} was not evaluated")
+        run = next((run for run in scenario.runs if run.recording.name == sequence), None)
+        if run is None:
+            raise LaeError(f"sequence: no {sequence!r} in {scenario.label}")
+        found = answers(
+            run,
+            scenario.trace.metadata,
+            forecaster,
+            scenario.forecasters[forecaster],
+            chosen,
+            scenario.costs.get(forecaster, 0),
+        )
+        truth = run.recording.truth
+        return pd.DataFrame(
+            {
+                "frame": np.arange(len(run)),
+                **dict(zip("xywh", found.boxes.T)),
+                "source_frame": found.source_frame,
+                **dict(zip(("truth_x", "truth_y", "truth_w", "truth_h"), truth.T)),
+                "iou": iou(found.boxes, truth),
+            }
+        )
+
+    def plot(self) -> Figure:
+        """Success and precision of all traces, or of a sweep how AUC and DP change over it."""
+        return plot_evaluations(self.parts)
+
+    def document(self, attributes: bool = False, per_sequence: bool = False) -> dict[str, Any]:
+        """All of it as one JSON object, as ``lae-sim replay --json`` prints it."""
+        from lae_sim import __version__
+
+        traces = [part.document(attributes, per_sequence) for part in self.parts]
+        return {"format": "lae-replay", "version": "1.0", "lae_sim": __version__, "traces": traces}
+
+    def _scenario(self, trace: str | None) -> Scenario:
+        named = {part.scenario.label: part.scenario for part in reversed(self.parts)}
+        if trace is None and len(named) == 1:
+            return next(iter(named.values()))
+        if trace not in named:
+            raise LaeError(f"trace: name one of {', '.join(reversed(named))}")
+        return named[trace]
+
+    def __repr__(self) -> str:
+        first, count = self.parts[0], len(self.parts)
+        rows = self.summary.head(len(first.scenario.forecasters) * len(first.scenario.world.sigmas))
+        rows = rows.drop_duplicates("forecaster")
+        scores = ", ".join(f"{row.forecaster} {row.auc:.4f}" for row in rows.itertuples())
+        more = f" and {count - 1} more" if count > 1 else ""
+        setting = f"{first.scenario.label}, {first.scenario.world.label()}"
+        return f"<EvaluationResult of {setting}{more}: AUC {scores}>"
+
+    def _repr_html_(self) -> str:
+        table = self.summary
+        shown = [
+            *(name for name in SETTING if table[name].nunique() > 1 or name == "trace"),
+            *("forecaster", "sigma", "sequences", "auc", "offline_auc", "recovered_auc", "dp20"),
+            *("age_ms", "exact"),
+        ]
+        html: str = table[shown].to_html(index=False, float_format="{:.4f}".format, na_rep="-")
+        return html + "".join(f"<p>{escape(note)}</p>" for note in self.notes)
+
+
+def _setting(scenario: Scenario) -> dict[str, Any]:
+    """What the rows of a scenario are of, by the names of :data:`SETTING`."""
+    metadata, world = scenario.trace.metadata, scenario.world
+    values = (
+        scenario.label,
+        metadata.tracker,
+        metadata.dataset,
+        label_of(world.policy),
+        float(scenario.runs.clock.fps),
+        label_of(world.latency),
+        float(world.scale),
+        world.convention,
+    )
+    return dict(zip(SETTING, values))
+
+
+def _exactness(part: Evaluated) -> list[str]:
+    departures = int(part.evaluation.departures.sum())
+    calls = int((part.evaluation.processed - 1).sum())
+    if not departures:
+        return []
+    return [
+        f"approximate: {100 * departures / calls:.3g}% of the outputs follow another frame than "
+        "when recorded; a tracker that searches near its last answer would do worse"
+    ]
+
+
+def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) -> Figure:
+    """Success and precision of evaluations, or of a sweep how AUC and DP change over it.
+
+    Args:
+        parts: of one or several traces, in one world or several.
+        sigma: the permitted latency of a sweep's scores; the first by default. Success and
+            precision are at the first in any case.
+    """
+    first = parts[0].scenario
+    at = first.world.sigmas[0] if sigma is None else sigma
+    traces = list(dict.fromkeys(part.scenario.label for part in parts))
+    title = "" if len(traces) > 1 else f"{first.label}: "
+    title += f"sigma {at}, convention {first.world.convention}"
+    reports = [part.document() for part in parts]
+    swept = [key for key in ("fps", "latency_scale") if len({each[key] for each in reports}) > 1]
+    if swept:
+        names = [part.scenario.label for part in parts]
+        return figures.sweep_figure(reports, names, float(at), swept, title)
+    curves = {}
+    for part in parts:
+        prefix = f"{part.scenario.label}: " if len(traces) > 1 else ""
+        found = figures.mean_curves(part.evaluation, part.scenario.forecasters)
+        curves.update({prefix + name: curve for name, curve in found.items()})
+    return figures.success_and_precision(curves, title)
+
+
+def evaluate(
+    traces: TraceLike | Sequence[TraceLike] | Mapping[str, TraceLike],
+    *,
+    forecasters: Forecasters = ("hold", "kalman"),
+    sigma: Number | Iterable[Number] = 0,
+    latency: str | LatencySource | Sequence[str | LatencySource] = "recorded",
+    scale: Number | Sequence[Number] = 1,
+    fps: Number | Sequence[Number] | None = None,
+    policy: str | Policy | Sequence[str | Policy] = "latest",
+    timing: TraceLike | None = None,
+    passes: TraceLike | Sequence[TraceLike] = (),
+    convention: str = "pysot",
+    costs: str | Sequence[str] = (),
+    sequences: str | Iterable[str] | None = None,
+    root: str | os.PathLike[str] | None = None,
+    dataset: str | None = None,
+    camera_lag: int | None = None,
+    progress: bool | None = None,
+) -> EvaluationResult:
+    """Replay traces and score them, latency counted.
+
+    What is a name, a duration or a number on the command line is one here too. Several latencies,
+    scales, rates or policies are a sweep: every combination is replayed.
+
+    Args:
+        traces: a trace, several, or a mapping from names to traces: paths, folders, globs, URLs, or
+            what :func:`read_trace` gives.
+        forecasters: names, classes or factories, or a mapping from names to these; ``"hold"``, the
+            baseline, is always scored.
+        sigma: permitted latencies in frames, or ``"grid"`` for 0, 0.02, ..., 1.
+        latency: where processing times come from, such as ``"recorded"`` or ``"constant:47ms"``.
+        scale: exact factor on all times: ``1.5`` is 3/2, ``0.1`` is 1/10.
+        fps: frames that the world shows per second, such as ``30`` or ``"30000/1001"``.
+        policy: which frame a free tracker takes, such as ``"latest"`` or ``"fifo"``.
+        timing: another device's trace of the same sequences, to take the times from.
+        passes: traces of the same tracker at other strides.
+        convention: how frames and thresholds count.
+        costs: what forecasting costs, such as ``"2ms"`` or ``"kalman=2ms"``.
+        sequences: those wanted; all by default.
+        root, dataset, camera_lag: the frames, for ``camera+NAME`` (see
+            :func:`lae_sim.learning.registry.find_camera`).
+        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+
+    Raises:
+        LaeError: if an argument is impossible, a file is missing, or a frame is asked for that a
+            trace lacks; it says which.
+
+    Example:
+        >>> import lae_sim
+        >>> result = lae_sim.evaluate("traces/synthetic-slow.parquet", latency="constant:47ms")
+        >>> result
+        <EvaluationResult of synthetic-slow.parquet, constant:47ms: AUC hold 0.4331, kalman 0.6058>
+        >>> result.to_frame().groupby("forecaster")["auc"].mean().round(4).to_dict()
+        {'hold': 0.4331, 'kalman': 0.6058}
+    """
+    opened = labelled_traces(traces, sequences)
+    names, factories = forecaster_names(forecasters)
+    worlds = World.sweep(
+        fps=fps,
+        policy=policy,
+        latency=latency,
+        scale=scale,
+        timing=timing,
+        passes=passes,
+        sigma=sigma,
+        convention=convention,
+        forecasters=names,
+        costs=costs,
+    )
+    wanted = [sequences] if isinstance(sequences, str) else sequences
+    asked = scenarios(
+        opened,
+        worlds,
+        factories=factories,
+        sequences=wanted,
+        root=root,
+        dataset=dataset,
+        camera_lag=camera_lag,
+    )
+    frames = [trace.frames for trace in opened.values()]
+    total = None if None in frames or wanted else sum(map(int, frames)) * len(worlds)  # type: ignore[arg-type]
+    with Progress(progress, total, "replay", "frames") as advance:
+        return EvaluationResult(tuple(each.evaluate(advance=advance) for each in asked))

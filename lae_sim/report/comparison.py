@@ -1,0 +1,130 @@
+"""Comparisons as text: of forecasters, and of replays with the closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter, itemgetter
+from typing import TYPE_CHECKING, Any
+
+from lae_sim.comparison.fidelity import FidelityRow, FidelitySummary
+from lae_sim.comparison.statistics import KEYS
+from lae_sim.report.table import (
+    METRIC_LABELS,
+    SCORE,
+    SIGNED,
+    Column,
+    Interval,
+    Number,
+    Table,
+    p_label,
+    setting_label,
+    text_of,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Row = Mapping[str, Any]
+
+
+def comparison_table(summary: pd.DataFrame) -> str:
+    """The summary as text: a line per trace, setting and forecaster, then how it was computed.
+
+    The first metric has intervals and tests, the others have their means. ``summary`` is what
+    :func:`summarise` or :func:`by_attribute` gave, or some rows of it.
+    """
+    first, *others = summary["metric"].unique()
+    baselines = [name[3:-7] for name in summary if name.endswith("_better")]
+    summary = summary.assign(
+        latency=[setting_label(*both) for both in zip(summary["latency"], summary["scale"])],
+        sigma=[s if isinstance(s, str) else f"{s:g}" for s in summary["sigma"]],
+    )
+    settings = ["trace", "latency", "sigma"]
+    several = [name for name in settings if summary[name].nunique() > 1]
+    shared = [f"{name} {summary[name].iloc[0]}" for name in settings if name not in several]
+    labels = [*(["attribute"] if "attribute" in summary else []), *several, "forecaster"]
+    keys = [key for key in KEYS[:-1] if key in summary]
+    means = summary.set_index([*keys, "metric"])["mean"].to_dict()
+
+    def mean_of(metric: str) -> Callable[[Row], float | None]:
+        return lambda row: means.get((*(row[name] for name in keys), metric))
+
+    columns = [
+        *(Column(name, itemgetter(name), is_label=True) for name in labels),
+        Column("n", itemgetter("sequences")),
+        Column(METRIC_LABELS.get(first, first), itemgetter("mean"), SCORE, _ends("low", "high")),
+        Column(
+            "recovered",
+            lambda row: None if row["forecaster"] in ("hold", "offline") else row["recovered"],
+            Number(".1f", 100, "%", ".0f"),
+            _ends("recovered_low", "recovered_high"),
+        ),
+        *(column for baseline in baselines for column in _against(baseline)),
+        *(Column(METRIC_LABELS.get(name, name), mean_of(name), SCORE) for name in others),
+    ]
+    rows = summary[summary["metric"] == first].to_dict("records")
+    caption = ", ".join(shared) + "\n\n" if shared else ""
+    method = f"\n{summary.attrs['method']}" if "method" in summary.attrs else ""
+    return caption + text_of(Table.of(columns, rows)) + method
+
+
+def _ends(low: str, high: str) -> Callable[[Row], Interval]:
+    return lambda row: (row[low], row[high])
+
+
+def _against(baseline: str) -> list[Column]:
+    """The mean paired difference to a baseline, its p, the sequences better and worse."""
+    name = f"vs_{baseline}"
+
+    def unless_it_is_the_baseline(value: Callable[[Row], Any]) -> Callable[[Row], Any]:
+        def of(row: Row) -> Any:
+            is_known = row["forecaster"] != baseline and row[name] == row[name]
+            return value(row) if is_known else None
+
+        return of
+
+    cells: dict[str, tuple[Callable[[Row], Any], Callable[..., str]]] = {
+        f"vs {baseline}": (itemgetter(name), SIGNED),
+        "p": (itemgetter(f"{name}_p"), p_label),
+        "+/-": (lambda row: f"{row[f'{name}_better']}/{row[f'{name}_worse']}", str),
+    }
+    return [
+        Column(title, unless_it_is_the_baseline(value), form)
+        for title, (value, form) in cells.items()
+    ]
+
+
+_REPLAYED = ("closed_loop", "forecaster", "replay")
+_FIDELITY = {
+    "closed_auc": "closed AUC",
+    "auc": "AUC",
+    "mean_abs_d_auc": "mean |d|",
+    "median_abs_d_auc": "median",
+    "max_abs_d_auc": "max",
+    "d_auc": "d",
+    "closed_dp20": "closed DP",
+    "dp20": "DP",
+    "mean_abs_d_dp20": "mean |d|",
+    "d_dp20": "d",
+}
+
+
+def fidelity_table(rows: Sequence[FidelityRow] | Sequence[FidelitySummary]) -> str:
+    """How far replays are from closed loops: a line per closed loop, forecaster and replay.
+
+    Of rows per sequence, a line each.
+    """
+    each = isinstance(rows[0], FidelityRow)
+    labels = [*_REPLAYED, "sequence"] if each else _REPLAYED
+    columns = [Column(key.replace("_", " "), attrgetter(key), is_label=True) for key in labels]
+    if not each:
+        columns.append(Column("sequences", attrgetter("sequences")))
+    columns += [
+        Column(title, attrgetter(key), SIGNED if key.startswith("d_") else SCORE)
+        for key, title in _FIDELITY.items()
+        if hasattr(rows[0], key)
+    ]
+    if each:
+        columns.append(Column("parted at", attrgetter("parted")))
+        columns.append(Column("disagree", attrgetter("disagreement"), SCORE))
+    return text_of(Table.of(columns, rows))

@@ -1,0 +1,259 @@
+"""The records of a study's results, and the flat rows that its JSON and CSV files hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from fractions import Fraction
+from functools import cached_property
+from typing import Any
+
+from lae_sim.comparison.statistics import Difference, Interval, Recovered
+
+MEAN = "mean"
+"""Stands for sigma where scores are plain means over all permitted latencies (mAUC, mDP)."""
+
+Plain = str | int | float | None
+
+
+class Record(Mapping[str, Any]):
+    """A record that is also read as its flat row: ``record["auc_low"]``."""
+
+    def flat(self) -> dict[str, Plain]:
+        """The flat row of JSON and CSV: unknown values are None, what is not asked has no key."""
+        return _plain(self)
+
+    @cached_property
+    def _flat(self) -> dict[str, Plain]:
+        return self.flat()
+
+    def __getitem__(self, key: str) -> Any:
+        return self._flat[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._flat)
+
+    def __len__(self) -> int:
+        return len(self._flat)
+
+
+def _plain(record: Any, until: str = "") -> dict[str, Plain]:
+    """The fields of a record, up to one of them; exact numbers as text."""
+    row: dict[str, Plain] = {}
+    for each in fields(record):
+        if each.name == until:
+            break
+        value = getattr(record, each.name)
+        row[each.name] = str(value) if isinstance(value, Fraction) else value
+    return row
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """How sure the mean of a score is, and what is won over hold.
+
+    Attributes:
+        interval: of the mean over sequences, bootstrapped.
+        jitter: the range of 95 % of the repetitions' means; None of one repetition.
+        vs_hold: the paired difference to hold; None of hold itself.
+        recovered: the share of the loss won back; None of hold, and where a trace lacks boxes.
+    """
+
+    interval: Interval
+    jitter: Interval | None = None
+    vs_hold: Difference | None = None
+    recovered: Recovered | None = None
+
+    def columns(self, metric: str) -> dict[str, Plain]:
+        """Values by their keys in a flat row."""
+        row = self.interval.columns(metric)
+        if self.jitter is not None:
+            row |= self.jitter.columns(f"{metric}_jitter")
+        if self.vs_hold is not None:
+            name = f"vs_hold_{metric}"
+            row |= {name: self.vs_hold.value, **self.vs_hold.interval.columns(name)}
+            row[f"{name}_p"] = self.vs_hold.p
+        if self.recovered is not None:
+            name = f"recovered_{metric}"
+            if self.recovered.share is not None:
+                row[name] = self.recovered.share
+            if self.recovered.interval is not None:
+                row |= self.recovered.interval.columns(name)
+        return dict(row)
+
+
+@dataclass(frozen=True)
+class Staleness:
+    """How old answers are, and when they first miss the target.
+
+    Attributes:
+        mismatch_mean: age of the outputs that answer, frames.
+        age_ms, age_max_ms: the same in world time, sigma included; mean and largest.
+        longest_stale_ms: longest time that one output answered.
+        failed: share of sequences and repetitions in which an answer misses the target wholly;
+            only at the first sigma.
+        time_to_failure_ms: median time to the first such answer (Kaplan and Meier); None if less
+            than half fail.
+    """
+
+    mismatch_mean: float
+    age_ms: float
+    age_max_ms: float
+    longest_stale_ms: float
+    failed: float | None = None
+    time_to_failure_ms: float | None = None
+
+    def columns(self) -> dict[str, Plain]:
+        """Values by their keys in a flat row."""
+        return _plain(self, until="failed" if self.failed is None else "")
+
+
+@dataclass(frozen=True)
+class SummaryRow(Record):
+    """The means of one trace, setting, convention, forecaster and sigma.
+
+    Attributes:
+        trace, tracker, dataset, device: of the boxes.
+        times_from: the trace that the times come from.
+        policy, fps, latency, scale: how it was replayed.
+        convention, forecaster: names.
+        sequences, repetitions: how many.
+        engine: ``"batch"`` or ``"simpy"``.
+        exact: whether every output follows the same frame as when recorded.
+        approximate_share: of the outputs, those that do not.
+        elapsed_ms: mean time of a call but the initialisation; None without such a call.
+        skip_rate: share of frames never processed.
+        sigma: permitted latency, frames, or ``MEAN`` over the grid of them.
+        scores, offline: mean of each metric in 0..1, under and without latency; None if unknown.
+        uncertainty: of AUC and DP, in the rows of the first sigma and of the mean over the grid.
+        staleness: of each sigma; None of their mean.
+        pareto: whether no other trace is both faster and better.
+    """
+
+    trace: str
+    tracker: str
+    dataset: str
+    device: str
+    times_from: str
+    policy: str
+    fps: Fraction
+    latency: str
+    scale: Fraction
+    convention: str
+    forecaster: str
+    sequences: int
+    repetitions: int
+    engine: str
+    exact: bool
+    approximate_share: float
+    elapsed_ms: float | None
+    skip_rate: float
+    sigma: Fraction | str
+    scores: Mapping[str, float | None]
+    offline: Mapping[str, float | None]
+    uncertainty: Mapping[str, Uncertainty] = field(default_factory=dict)
+    staleness: Staleness | None = None
+    pareto: bool = False
+
+    def flat(self) -> dict[str, Plain]:
+        """The flat row of JSON and CSV: unknown values are None, what is not asked has no key."""
+        row = {**_plain(self, until="scores"), **self.scores}
+        row |= {f"offline_{metric}": value for metric, value in self.offline.items()}
+        for metric, uncertainty in self.uncertainty.items():
+            row |= uncertainty.columns(metric)
+        if self.staleness is not None:
+            row |= self.staleness.columns()
+        return {**row, "pareto": self.pareto}
+
+
+@dataclass(frozen=True)
+class Comparison(Record):
+    """Two traces of one dataset against each other, in one setting, with one forecaster.
+
+    Attributes:
+        dataset, policy, fps, latency, scale, convention, forecaster, sigma: what they share.
+        a, b: the traces, with that of their times, if from another.
+        sequences: how many both have a score of.
+        difference: of the mean AUC, a - b, paired over the sequences.
+        better_here: how probable it is that one run of a beats one of b on these sequences (a tie
+            counts half); None without jitter.
+        better: the same on other sequences like these.
+        p_holm: p of the difference, corrected for the number of pairs of its group.
+    """
+
+    dataset: str
+    policy: str
+    fps: Fraction
+    latency: str
+    scale: Fraction
+    convention: str
+    forecaster: str
+    sigma: Fraction | str
+    a: str
+    b: str
+    sequences: int
+    difference: Difference
+    better_here: float | None
+    better: float
+    p_holm: float = 1.0
+
+    def flat(self) -> dict[str, Plain]:
+        """The flat row of JSON and CSV."""
+        return {
+            **_plain(self, until="difference"),
+            "difference": self.difference.value,
+            **self.difference.interval.columns("difference"),
+            "p": self.difference.p,
+            "better_here": self.better_here,
+            "better": self.better,
+            "p_holm": self.p_holm,
+        }
+
+
+@dataclass(frozen=True)
+class Requirement(Record):
+    """What a required AUC asks of a device and of the world.
+
+    Attributes:
+        trace, times_from, policy, fps, latency, convention, forecaster, sigma: where it is asked.
+        required_auc: the mean AUC.
+        scale: the largest scale of all times at which it is reached, in hundredths; None if it is
+            not even without latency.
+        auc: the mean AUC there.
+        beyond: the hundredth after it; None if the largest that is tried is enough.
+        beyond_auc: the mean AUC there, too low.
+        auc_without_latency: the mean AUC at scale 0.
+        speed_up: how much faster the device must be, 1 / scale; None without a scale above 0.
+        fps_at_most: how fast the world may move, with the recorded motion from frame to frame;
+            None where a cost or a policy has a time of its own.
+    """
+
+    trace: str
+    times_from: str
+    policy: str
+    fps: Fraction
+    latency: str
+    convention: str
+    forecaster: str
+    sigma: Fraction
+    required_auc: float
+    scale: Fraction | None
+    auc: float | None
+    beyond: Fraction | None
+    beyond_auc: float | None
+    auc_without_latency: float
+    speed_up: float | None
+    fps_at_most: float | None
+
+
+@dataclass(frozen=True)
+class Failure(Record):
+    """A piece of work that could not be done.
+
+    Attributes:
+        of: what it is about, in words.
+        reason: why, in a line or two.
+    """
+
+    of: str
+    reason: str

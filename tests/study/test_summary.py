@@ -1,0 +1,163 @@
+"""Records of a study: flat only in files, kept as they are, and the front of rivals."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from places import REPOSITORY
+
+from lae_sim.comparison.statistics import Difference, Interval, Recovered
+from lae_sim.replay.world import SIGMA_GRID
+from lae_sim.study.records import Failure, Staleness, SummaryRow, Uncertainty
+from lae_sim.study.run import run_study, write_csv
+from lae_sim.study.spec import Study
+from lae_sim.study.summary import _front, _median_survival
+
+SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
+FAST = REPOSITORY / "traces" / "synthetic-fast.parquet"
+
+
+def summary_row(**values):
+    row = SummaryRow(
+        trace="a",
+        tracker="A",
+        dataset="D",
+        device="unknown",
+        times_from="a",
+        policy="latest",
+        fps=Fraction(30000, 1001),
+        latency="recorded",
+        scale=Fraction(3, 2),
+        convention="pysot",
+        forecaster="kalman",
+        sequences=3,
+        repetitions=1,
+        engine="batch",
+        exact=True,
+        approximate_share=0.0,
+        elapsed_ms=None,
+        skip_rate=0.5,
+        sigma=Fraction(1, 50),
+        scores={"auc": 0.5, "dp20": None},
+        offline={"auc": 0.6, "dp20": None},
+    )
+    return dataclasses.replace(row, **values)
+
+
+HEAD = [
+    "trace", "tracker", "dataset", "device", "times_from", "policy", "fps", "latency", "scale",
+    "convention", "forecaster", "sequences", "repetitions", "engine", "exact",
+    "approximate_share", "elapsed_ms", "skip_rate", "sigma",
+    "auc", "dp20", "offline_auc", "offline_dp20",
+]  # fmt: skip
+
+
+def test_a_flat_row_has_exact_numbers_as_text_and_no_key_of_what_was_not_asked():
+    row = summary_row().flat()
+    assert list(row) == [*HEAD, "pareto"]
+    assert (row["fps"], row["scale"], row["sigma"]) == ("30000/1001", "3/2", "1/50")
+    assert (row["elapsed_ms"], row["dp20"], row["pareto"]) == (None, None, False)
+
+
+def test_a_flat_row_has_all_that_is_known_in_order():
+    ends = Interval(0.1, 0.2)
+    auc = Uncertainty(ends, ends, Difference(0.1, ends, 0.5, 2, 1), Recovered(0.3, ends))
+    whole = Staleness(1.0, 33.0, 66.0, 99.0, 0.5, None)
+    row = summary_row(uncertainty={"auc": auc}, staleness=whole, pareto=True).flat()
+    assert list(row)[len(HEAD) :] == [
+        "auc_low", "auc_high", "auc_jitter_low", "auc_jitter_high",
+        "vs_hold_auc", "vs_hold_auc_low", "vs_hold_auc_high", "vs_hold_auc_p",
+        "recovered_auc", "recovered_auc_low", "recovered_auc_high",
+        "mismatch_mean", "age_ms", "age_max_ms", "longest_stale_ms",
+        "failed", "time_to_failure_ms", "pareto",
+    ]  # fmt: skip
+    assert (row["failed"], row["time_to_failure_ms"], row["pareto"]) == (0.5, None, True)
+    later = dataclasses.replace(whole, failed=None)
+    assert list(later.columns()) == ["mismatch_mean", "age_ms", "age_max_ms", "longest_stale_ms"]
+
+
+@pytest.mark.parametrize(
+    ("recovered", "keys"),
+    [
+        (Recovered(None, None), []),
+        (Recovered(0.5, None), ["recovered_auc"]),
+        (Recovered(None, Interval(0, 1)), ["recovered_auc_low", "recovered_auc_high"]),
+    ],
+)
+def test_what_is_unknown_of_the_recovered_share_has_no_key(recovered, keys):
+    uncertainty = Uncertainty(Interval(0, 1), recovered=recovered)
+    assert list(uncertainty.columns("auc")) == ["auc_low", "auc_high", *keys]
+
+
+def test_records_do_not_change():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        summary_row().pareto = True
+    with pytest.raises(TypeError, match="item assignment"):
+        Failure("a", "b")["reason"] = "c"
+
+
+def test_records_hold_what_the_files_say(tmp_path):
+    study = Study(
+        (str(SLOW), str(FAST)),
+        sequences=("bike-pan", "car-chase", "person-crowd"),
+        sigmas=SIGMA_GRID,
+        require_auc=Fraction(1, 2),
+    )
+    results = run_study(study, tmp_path, workers=1)
+    rows = {(row.trace, row.forecaster, row.sigma): row for row in results.summary}
+    kalman = rows["synthetic-slow", "kalman", "mean"]
+    uncertainty = kalman.uncertainty["auc"]
+    flat = kalman.flat()
+    assert uncertainty.interval == Interval(flat["auc_low"], flat["auc_high"])
+    assert uncertainty.vs_hold.value == flat["vs_hold_auc"]
+    assert uncertainty.recovered.share == flat["recovered_auc"]
+    assert (uncertainty.jitter, kalman.staleness) == (None, None)
+    assert rows["synthetic-slow", "hold", "mean"].uncertainty["auc"].vs_hold is None
+    assert rows["synthetic-slow", "hold", Fraction(0)].staleness.failed is not None
+    assert rows["synthetic-slow", "hold", Fraction(1, 50)].staleness.failed is None
+    assert rows["synthetic-slow", "hold", Fraction(1, 50)].uncertainty == {}
+    document = json.loads((tmp_path / "study.json").read_text())
+    for name in ("summary", "comparisons", "required", "failures"):
+        assert document[name] == [record.flat() for record in getattr(results, name)]
+    [pair, _] = results.comparisons
+    assert (pair.a, pair.b, pair.sequences) == ("synthetic-slow", "synthetic-fast", 3)
+    assert pair.p_holm == pair.difference.p  # of one pair
+
+
+def test_a_table_has_a_column_for_every_key_of_any_row(tmp_path):
+    interval = {"auc": Uncertainty(Interval(0.25, 0.75))}
+    write_csv([summary_row(), summary_row(uncertainty=interval)], tmp_path / "a.csv")
+    header, first, second = (tmp_path / "a.csv").read_text().splitlines()
+    assert header.split(",") == [*HEAD, "pareto", "auc_low", "auc_high"]
+    assert first.endswith(",False,,")
+    assert second.endswith(",False,0.25,0.75")
+
+
+def test_the_front_is_of_those_that_nobody_beats_in_both():
+    rows = [
+        summary_row(scores={"auc": auc}, elapsed_ms=ms)
+        for auc, ms in [
+            (0.5, 10),
+            (0.6, 20),
+            (0.5, 20),
+            (0.4, 30),
+            (0.6, 20),
+            (None, 1),
+            (0.9, None),
+        ]
+    ]
+    assert _front(rows) == [0, 1, 4]
+
+
+def test_half_is_half_where_floats_would_miss_it():
+    # survival 2/3 x 3/4 = 1/2; in every such case
+    for count in range(2, 40):
+        times, failed = np.arange(1.0, count + 1), np.ones(count, bool)
+        assert _median_survival(times, failed) == (count + 1) // 2
+    assert _median_survival(np.array([1.0, 2, 3]), np.array([True, False, False])) is None
+    # censored before the failures: 1, then 1 - 1/2
+    assert _median_survival(np.array([1.0, 2, 3]), np.array([False, True, False])) == 2
