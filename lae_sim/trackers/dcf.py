@@ -156,9 +156,9 @@ class Dcf:
     def _channels(self, frame: Image) -> Any:
         """Fourier transform of the search window's channels, complex64 [C, CELLS, CELLS/2 + 1]."""
         side = self._side()
-        found = features(crop(frame, self._centre, (side, side), CELLS * CELL))
-        found -= found.mean((1, 2), keepdims=True)
-        return self._fft.rfft2(self._to(found * self._window))
+        channels = features(crop(frame, self._centre, (side, side), CELLS * CELL))
+        channels -= channels.mean((1, 2), keepdims=True)
+        return self._fft.rfft2(self._to(channels * self._window))
 
     def _learn(self, frame: Image) -> None:
         """Bring the filter up to date.
