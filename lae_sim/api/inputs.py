@@ -1,11 +1,9 @@
-"""Arguments as people give them: traces, forecasters, progress."""
+"""Arguments as people give them: traces and forecasters."""
 
 from __future__ import annotations
 
 import os
-import sys
-import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 from lae_sim.errors import LaeError
@@ -78,53 +76,3 @@ def forecaster_names(forecasters: Forecasters) -> tuple[tuple[str, ...], dict[st
         else:
             raise LaeError(f"forecasters: {each!r:.60} is neither a name nor makes forecasters")
     return tuple(dict.fromkeys(names)), objects
-
-
-class Progress:
-    """A progress bar on a terminal or in a notebook; elsewhere nothing.
-
-    Args:
-        show: True or False to decide; None to show it where somebody looks.
-        total: how many steps there are, if known.
-        what: what is going on.
-        unit: of the steps.
-    """
-
-    def __init__(self, show: bool | None, total: int | None, what: str, unit: str) -> None:
-        shown = _somebody_looks() if show is None else show
-        self._bar = _bar(total=total, desc=what, unit=f" {unit}", disable=not shown)
-
-    def __enter__(self) -> Callable[[int, str], None]:
-        """What tells of so many more steps, and perhaps of what is next."""
-
-        def advance(steps: int, what: str = "") -> None:
-            if what:
-                self._bar.set_description(what, refresh=False)
-            self._bar.update(steps)
-
-        return advance
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.close()
-
-
-def _somebody_looks() -> bool:
-    stream = sys.stderr
-    return (stream is not None and stream.isatty()) or _in_notebook()
-
-
-def _in_notebook() -> bool:
-    shell = sys.modules.get("IPython")
-    running = shell.get_ipython() if shell is not None else None
-    return running is not None and hasattr(running, "kernel")
-
-
-def _bar(**options: Any) -> Any:
-    """A bar of text, or in a notebook that has widgets one of these."""
-    if _in_notebook() and not options["disable"]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # tqdm says that there are no widgets
-            from tqdm.auto import tqdm
-    else:
-        from tqdm import tqdm
-    return tqdm(unit_scale=options["unit"] == " frames", **options)

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser
-from lae_sim.cli.progress import ProgressBar
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct
+from lae_sim.progress import ProgressBar
 
 if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser, parse_box
-from lae_sim.cli.progress import ProgressBar
 from lae_sim.engine.clock import parse_duration, parse_fps, parse_stride, whole
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.plugins import key_and_value
+from lae_sim.progress import ProgressBar
 
 if TYPE_CHECKING:
     from lae_sim.profile.passes import PassSummary

@@ -1,0 +1,200 @@
+"""Comparing forecasters in one call."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from lae_sim.api.inputs import Forecasters, forecaster_names, labelled_traces
+from lae_sim.comparison.forecasters import OFFLINE, score_forecasters, steps
+from lae_sim.comparison.statistics import by_attribute, over_sigmas, summarise
+from lae_sim.engine.clock import Number
+from lae_sim.engine.scheduler import Policy, scores_latency
+from lae_sim.errors import LaeError
+from lae_sim.evaluation.metrics import find_convention
+from lae_sim.learning.registry import find_camera, load_any
+from lae_sim.progress import ProgressBar
+from lae_sim.replay.latency import LatencySource
+from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, label_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+    from lae_sim.trace.file import Trace
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ComparisonResult:
+    """What :func:`compare_forecasters` found.
+
+    Attributes:
+        traces: by name.
+        scores: the tidy table of :func:`lae_sim.comparison.forecasters.score_forecasters`.
+        whole_grid: whether the scores are compared as means over the whole grid of sigmas.
+        seed: of the bootstrap.
+    """
+
+    traces: Mapping[str, Trace]
+    scores: DataFrame
+    whole_grid: bool
+    seed: int
+
+    @property
+    def metrics(self) -> tuple[str, str]:
+        """The metrics that are compared."""
+        return ("mauc", "mdp20") if self.whole_grid else ("auc", "dp20")
+
+    @property
+    def notes(self) -> list[str]:
+        """What was trained, and which replays are approximations."""
+        notes: list[str] = self.scores.attrs["notes"]
+        return notes
+
+    @cached_property
+    def summary(self) -> DataFrame:
+        """Means, paired differences and shares of the loss recovered, with intervals and tests.
+
+        See :func:`lae_sim.comparison.statistics.summarise`.
+        """
+        return summarise(self._compared, metrics=self.metrics, seed=self.seed)
+
+    @cached_property
+    def attributes(self) -> DataFrame:
+        """The same for the sequences of each attribute of the datasets."""
+        members = {
+            (trace.metadata.dataset, name): trace.metadata.attributes(name)
+            for trace in self.traces.values()
+            for name in self.scores.loc[
+                self.scores["dataset"] == trace.metadata.dataset, "sequence"
+            ].unique()
+        }
+        return by_attribute(self._compared, members, metrics=self.metrics, seed=self.seed)
+
+    @cached_property
+    def _compared(self) -> DataFrame:
+        return over_sigmas(self.scores) if self.whole_grid else self.scores
+
+    def to_frame(self) -> DataFrame:
+        """Every score: a row per trace, sequence, latency, scale, forecaster, sigma and metric."""
+        return self.scores
+
+    def plot(self) -> Figure:
+        """The mean of each forecaster with its interval, and the share recovered beside it."""
+        from lae_sim.report.forecaster_figures import overview
+
+        return overview(self.summary, self.metrics[0])
+
+    def __str__(self) -> str:
+        from lae_sim.report.comparison import comparison_table
+
+        return "\n\n".join([comparison_table(self.summary), *self.notes])
+
+    def __repr__(self) -> str:
+        table = self.summary[self.summary["metric"] == self.metrics[0]]
+        first = table.drop_duplicates("forecaster")
+        scores = ", ".join(f"{row.forecaster} {row.mean:.4f}" for row in first.itertuples())
+        setting = f"{first['trace'].iloc[0]}, {first['latency'].iloc[0]}"
+        more = len(table.drop_duplicates(["trace", "latency", "scale", "sigma"])) - 1
+        return f"<ComparisonResult of {setting}{f' and {more} more' * bool(more)}: AUC {scores}>"
+
+    def _repr_html_(self) -> str:
+        table = self.summary[self.summary["metric"] == self.metrics[0]]
+        html: str = table.to_html(index=False, float_format="{:.4f}".format, na_rep="-")
+        return html + "".join(f"<p>{escape(note)}</p>" for note in self.notes)
+
+
+def compare_forecasters(
+    traces: TraceLike | Sequence[TraceLike] | Mapping[str, TraceLike],
+    *,
+    forecasters: Forecasters = ("kalman", "least-squares", "tuned-kalman"),
+    sigma: Number | Iterable[Number] = 0,
+    latency: str | LatencySource | Sequence[str | LatencySource] = "recorded",
+    scale: Number | Sequence[Number] = 1,
+    fps: Number | None = None,
+    policy: str | Policy = "latest",
+    convention: str = "pysot",
+    costs: str | Sequence[str] = (),
+    sequences: str | Iterable[str] | None = None,
+    root: str | os.PathLike[str] | None = None,
+    dataset: str | None = None,
+    camera_lag: int | None = None,
+    folds: int = 5,
+    seed: int = 0,
+    progress: bool | None = None,
+) -> ComparisonResult:
+    """Which forecaster helps, by how much, and how sure that is.
+
+    Forecasters that must be trained (``"tuned-kalman"``, ``"learned"``, your own trainers) are
+    trained across folds, and scored only on sequences that they have not seen.
+
+    Args:
+        traces: a trace, several, or a mapping from names to traces: paths, folders, globs, URLs, or
+            what :func:`read_trace` gives.
+        forecasters: names, classes, factories or trainers, or a mapping from names to these;
+            ``"hold"`` and the tracker's own ``offline`` score are always compared.
+        sigma: permitted latencies in frames, or ``"grid"``, whose scores are compared as means.
+        latency, scale: one or several, one after another, as in :func:`evaluate`.
+        fps, policy, convention, costs, sequences: as in :func:`evaluate`.
+        root, dataset, camera_lag: the frames, for ``camera+NAME`` (see
+            :func:`lae_sim.learning.registry.find_camera`).
+        folds: in how many parts the sequences are dealt out, if anything is trained.
+        seed: of folds, training and bootstrap.
+        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+
+    Raises:
+        LaeError: if an argument is impossible, a file is missing, or a frame is asked for that a
+            trace lacks; it says which.
+
+    Example:
+        >>> import lae_sim
+        >>> found = lae_sim.compare_forecasters(
+        ...     "traces/synthetic-slow.parquet", forecasters="kalman", latency="constant:47ms"
+        ... )
+        >>> found
+        <ComparisonResult of synthetic-slow.parquet, constant:47ms: AUC hold 0.5791, kalman 0.6414, \
+offline 0.7773>
+    """
+    opened = labelled_traces(traces, sequences)
+    names, objects = forecaster_names(forecasters)
+    if OFFLINE in names:
+        raise LaeError("offline is always in the table: the tracker's own boxes, without latency")
+    find_convention(convention)
+    worlds = World.sweep(
+        fps=fps,
+        policy=policy,
+        latency=latency,
+        scale=scale,
+        sigma=sigma,
+        convention=convention,
+        costs=costs,
+    )
+    if not scores_latency(worlds[0].rule()):
+        raise LaeError(f"{label_of(policy)} never scores latency: there is nothing to forecast")
+    if (
+        root is not None
+        and len({(t.metadata.dataset, t.metadata.fps) for t in opened.values()}) > 1
+    ):
+        raise LaeError("--root is the folder of one dataset: compare its traces by themselves")
+    rate = worlds[0].fps or next(iter(opened.values())).metadata.fps
+    wanted = [sequences] if isinstance(sequences, str) else sequences
+    folder = None if root is None else os.fspath(root)
+    camera = find_camera(folder, dataset, list(wanted) if wanted else None, rate, camera_lag)
+    ready: dict[str, Any] = {
+        name: objects.get(name) or load_any(name, camera)
+        for name in dict.fromkeys(["hold", *names])
+    }
+    total, done = steps(opened, ready, worlds, folds), 0
+    with ProgressBar("compare", "steps", progress) as bar:
+
+        def advance(what: str) -> None:
+            nonlocal done
+            done += 1
+            bar(done, total, what)
+
+        scores = score_forecasters(opened, ready, worlds, folds, seed, advance)
+    return ComparisonResult(opened, scores, worlds[0].sigmas == SIGMA_GRID, seed)
