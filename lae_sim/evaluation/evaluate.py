@@ -188,7 +188,7 @@ Observer: TypeAlias = "Callable[[ScoredRun], object]"
 """``observer(scored)`` takes a run that is being scored, each in its turn."""
 
 
-def evaluate(
+def evaluate_runs(
     runs: Iterable[Run],
     metadata: Metadata,
     forecasters: Mapping[str, AnyFactory],
@@ -228,7 +228,7 @@ def evaluate_groups(
     """The same, group after group of sequences, for those who keep less than all of it.
 
     Args:
-        runs, metadata, forecasters, sigmas, convention, costs: see :func:`evaluate`.
+        runs, metadata, forecasters, sigmas, convention, costs: see :func:`evaluate_runs`.
         frames: about how many world frames are scored at once: the more, the faster, and the more
             memory.
         curves_at: the sigma of the success and precision curves; the first by default.
@@ -236,7 +236,7 @@ def evaluate_groups(
         observed: the answers that they look at, by forecaster and sigma.
 
     Raises:
-        LaeError: as :func:`evaluate`.
+        LaeError: as :func:`evaluate_runs`.
     """
     if not forecasters:
         raise LaeError("name at least one forecaster, such as hold")

@@ -215,13 +215,11 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
     """
     import numpy as np
 
-    from lae_sim.trace import describe as timing
-
     metadata = trace.metadata
     entries = metadata.document.get("sequences", {})
     sequences, frames, with_truth, sizes = [], 0, 0, Counter[str]()
     for recording in trace:
-        sequences.append(timing.SequenceTimes.of(recording))
+        sequences.append(SequenceTimes.of(recording))
         frames += len(recording)
         with_truth += int((~np.isnan(recording.truth[:, 0])).sum())
         size = metadata.image_size(recording.name)
@@ -245,15 +243,15 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
         "lost": sum(lost) if all(isinstance(n, int) for n in lost) else None,
         "failures": failures if isinstance(failures, list) else [],
         "times": {
-            "calls": timing.summary(calls),
-            "initialisations": timing.summary(np.array([s.init_ns for s in sequences])),
+            "calls": summary(calls),
+            "initialisations": summary(np.array([s.init_ns for s in sequences])),
             "frame_interval_ms": float(1000 / metadata.fps),
-            "slower_than_frames": timing.share_slower(calls, metadata.fps),
-            "histogram": timing.histogram(calls) if len(calls) else None,
-            "first_calls": timing.first_calls(sequences),
+            "slower_than_frames": share_slower(calls, metadata.fps),
+            "histogram": histogram(calls) if len(calls) else None,
+            "first_calls": first_calls(sequences),
             "order_known": ordered,
-            "drift": timing.drift(sequences),
-            "stalls": timing.stalls(sequences),
+            "drift": drift(sequences),
+            "stalls": stalls(sequences),
         },
     }
     return {**report, "warnings": list(_warnings(report, metadata))}, sequences

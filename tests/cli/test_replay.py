@@ -12,7 +12,11 @@ import pytest
 from places import REPOSITORY
 
 import lae_sim
+from lae_sim.engine.policies import every, fifo, shrinking_tail, vot_realtime
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.evaluation.events import KINDS
+from lae_sim.evaluation.metrics import success_curve
+from lae_sim.replay.latency import constant
 from lae_sim.report.figures import sweep_figure
 
 SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
@@ -99,10 +103,10 @@ def test_the_table_has_a_line_for_each_trace_and_forecaster():
 def test_json_agrees_with_the_api():
     report = replay_json(SLOW, "--latency", "constant:47ms", "--sigma", "0", "1/2")["traces"][0]
     trace = lae_sim.read_trace(SLOW)
-    runs = lae_sim.replay_trace(trace, latency=lae_sim.constant(ns=47_000_000))
+    runs = lae_sim.replay_trace(trace, latency=constant(ns=47_000_000))
     forecasters = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
     sigmas = [Fraction(0), Fraction(1, 2)]
-    found = lae_sim.evaluate(runs, trace.metadata, forecasters, sigmas)
+    found = evaluate_runs(runs, trace.metadata, forecasters, sigmas)
     assert report["world_frames"] == found.replay.frames.sum() == trace.frames
     assert report["processed"] == found.replay.processed.sum()
     assert report["mismatch_sum"] == found.staleness.mismatch_sum[:, 0].sum()
@@ -158,10 +162,10 @@ def test_policies_by_name(policy):
     report = replay_json(SLOW, "--policy", policy)["traces"][0]
     name = policy.split(":")[0]
     by_name = {
-        "fifo": lae_sim.fifo,
-        "every": lae_sim.every(2),
-        "shrinking-tail": lae_sim.shrinking_tail(ns=47_000_000),
-        "vot-realtime": lae_sim.vot_realtime(),
+        "fifo": fifo,
+        "every": every(2),
+        "shrinking-tail": shrinking_tail(ns=47_000_000),
+        "vot-realtime": vot_realtime(),
     }
     runs = list(lae_sim.replay_trace(lae_sim.read_trace(SLOW), policy=by_name[name]))
     assert report["policy"] == policy
@@ -223,7 +227,7 @@ def test_result_text_files_score_as_the_table_says(tmp_path):
             boxes = np.loadtxt(path, delimiter=",")
             assert boxes.shape == (len(recording), 4)
             pysot = lae_sim.CONVENTIONS["pysot"]
-            scores.append(lae_sim.success_curve(recording.truth, boxes, pysot).mean())
+            scores.append(success_curve(recording.truth, boxes, pysot).mean())
         assert np.mean(scores) == pytest.approx(result["auc"], abs=1e-12)
     error = replay(SLOW, "--export-txt", tmp_path / "results", status=2)
     assert "is there already" in error

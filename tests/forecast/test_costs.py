@@ -12,7 +12,7 @@ from witness import moving
 from lae_sim.comparison.forecasters import compare_forecasters
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import answers, evaluate
+from lae_sim.evaluation.evaluate import answers, evaluate_runs
 from lae_sim.forecast.base import ConstantVelocity, Hold, Oracle
 from lae_sim.forecast.costs import cost_notes, measure_cost, parse_cost, resolve_costs
 from lae_sim.forecast.kalman import Kalman
@@ -91,9 +91,9 @@ def test_a_measured_cost_is_that_of_one_answer() -> None:
 
 
 def test_a_cost_lowers_the_scores_of_those_who_pay_it_alone() -> None:
-    free = evaluate(RUNS, EVERY, FACTORIES, SIGMAS)
-    zero = evaluate(RUNS, EVERY, FACTORIES, SIGMAS, costs=dict.fromkeys(FACTORIES, 0))
-    paid = evaluate(RUNS, EVERY, FACTORIES, SIGMAS, costs={"kalman": 20_000_000, "absent": 9})
+    free = evaluate_runs(RUNS, EVERY, FACTORIES, SIGMAS)
+    zero = evaluate_runs(RUNS, EVERY, FACTORIES, SIGMAS, costs=dict.fromkeys(FACTORIES, 0))
+    paid = evaluate_runs(RUNS, EVERY, FACTORIES, SIGMAS, costs={"kalman": 20_000_000, "absent": 9})
     for metric, scores in free.scores.items():
         np.testing.assert_array_equal(zero.scores[metric], scores)
         np.testing.assert_array_equal(paid.scores[metric][[0, 2]], scores[[0, 2]])
