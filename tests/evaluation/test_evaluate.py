@@ -28,8 +28,15 @@ from lae_sim.boxes import iou
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import vot_realtime
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import Evaluation, answers, evaluate_runs
-from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, precision_curve, success_curve
+from lae_sim.evaluation.evaluate import (
+    Evaluation,
+    ScoredRun,
+    answers,
+    evaluate_groups,
+    evaluate_runs,
+)
+from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, PYSOT, precision_curve, success_curve
+from lae_sim.evaluation.pairing import pair
 from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
 from lae_sim.replay.latency import constant
@@ -282,6 +289,67 @@ def test_joined_is_the_evaluation_of_all() -> None:
     for metric in METRICS:
         assert joined.scores[metric].tobytes() == whole.scores[metric].tobytes()
         assert joined.offline[metric].tobytes() == whole.offline[metric].tobytes()
+
+
+COSTS = {"kalman": 15_000_000}
+
+
+@pytest.mark.parametrize("frames", [1, 60, 10**6])
+def test_observers_see_what_is_scored(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lae_sim.evaluation.evaluate._PART", 40)  # outputs: a sequence or two
+    runs = [replay_sequence(moving(20 + 9 * seed, seed, f"s{seed}"), CLOCK) for seed in range(5)]
+    sigmas = [Fraction(-1, 3), Fraction(0), Fraction(3, 4)]
+    observed = [(name, sigma) for name in ("kalman", "hold") for sigma in (sigmas[2], sigmas[0])]
+    seen: list[ScoredRun] = []
+    more = {"frames": frames, "observers": [seen.append], "observed": observed}
+    parts = evaluate_groups(runs, EVERY, FORECASTERS, sigmas, costs=COSTS, **more)  # type: ignore[arg-type]
+    found = Evaluation.joined(list(parts))
+    assert [scored.run for scored in seen] == runs
+    for s, (run, scored) in enumerate(zip(runs, seen)):
+        assert set(scored.answers) == set(observed)
+        for (name, sigma), one in scored.answers.items():
+            cost = COSTS.get(name, 0)
+            separate = answers(run, EVERY, name, FORECASTERS[name], sigma, cost)
+            assert one.boxes.tobytes() == separate.boxes.tobytes()
+            assert one.source_frame.tolist() == separate.source_frame.tolist()
+            score = success_curve(run.recording.truth, one.boxes, PYSOT).mean()
+            f, m = list(FORECASTERS).index(name), sigmas.index(sigma)
+            assert found.scores["auc"][f, s, m] == pytest.approx(score)
+        for sigma in sigmas:
+            for cost in (0, *COSTS.values()):
+                chosen, alone = scored.pairing(sigma, cost), pair([run.schedule], [sigma], cost)
+                for field in ("lengths", "offsets", "frames", "first", "end"):
+                    assert getattr(chosen, field).tolist() == getattr(alone, field).tolist()
+                for field in ("mismatch_sum", "mismatch_max", "longest_hold"):
+                    assert getattr(chosen, field).tolist() == getattr(alone, field).tolist()
+
+
+def test_curves_are_at_the_sigma_that_is_asked_for() -> None:
+    runs = [replay_sequence(moving(30, seed, f"s{seed}"), CLOCK) for seed in range(3)]
+    sigmas = [Fraction(0), Fraction(1, 2), Fraction(1)]
+    for sigma in sigmas:
+        (part,) = evaluate_groups(runs, EVERY, FORECASTERS, sigmas, curves_at=sigma)
+        only = evaluate_runs(runs, EVERY, FORECASTERS, [sigma])
+        assert part.curves.success.tobytes() == only.curves.success.tobytes()
+        assert part.curves.precision.tobytes() == only.curves.precision.tobytes()
+    first = evaluate_runs(runs, EVERY, FORECASTERS, sigmas).curves.success
+    assert first.tobytes() == evaluate_runs(runs, EVERY, FORECASTERS).curves.success.tobytes()
+
+
+def test_nothing_to_evaluate_is_said() -> None:
+    with pytest.raises(LaeError, match="no sequences"):
+        evaluate_runs([], EVERY, FORECASTERS)
+    with pytest.raises(LaeError, match="at least one forecaster"):
+        evaluate_runs([replay_sequence(moving(9), CLOCK)], EVERY, {})
+
+
+def test_chosen_sequences_keep_their_statistics() -> None:
+    runs = [replay_sequence(moving(20 + seed, seed, f"s{seed}"), CLOCK) for seed in range(5)]
+    replay = evaluate_runs(runs, EVERY, {"hold": Hold}).replay
+    some = replay.chosen(np.array([3, 1]))
+    assert some.sequences == ("s3", "s1")
+    assert some.frames.tolist() == [23, 21]
+    assert some.calls_ns.tolist() == replay.calls_ns[[3, 1]].tolist()
 
 
 def test_vot_scores_each_output_at_its_own_frame() -> None:
