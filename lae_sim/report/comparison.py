@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.comparison.fidelity import FidelityRow, FidelitySummary
@@ -13,9 +12,9 @@ from lae_sim.report.table import (
     SCORE,
     SIGNED,
     Column,
-    Interval,
     Number,
     Table,
+    is_unknown,
     p_label,
     setting_label,
     text_of,
@@ -50,47 +49,41 @@ def comparison_table(summary: pd.DataFrame) -> str:
         return lambda row: means.get((*(row[name] for name in keys), metric))
 
     columns = [
-        *(Column(name, itemgetter(name), is_label=True) for name in labels),
-        Column("n", itemgetter("sequences")),
-        Column(METRIC_LABELS.get(first, first), itemgetter("mean"), SCORE, _ends("low", "high")),
-        Column(
-            "recovered",
-            lambda row: None if row["forecaster"] in ("hold", "offline") else row["recovered"],
-            Number(".1f", 100, "%", ".0f"),
-            _ends("recovered_low", "recovered_high"),
-        ),
+        *(Column(name, name, is_label=True) for name in labels),
+        Column("n", "sequences"),
+        Column(METRIC_LABELS.get(first, first), "mean", SCORE),
+        Column("recovered", "recovered", Number(".1f", 100, "%", ".0f")),
         *(column for baseline in baselines for column in _against(baseline)),
         *(Column(METRIC_LABELS.get(name, name), mean_of(name), SCORE) for name in others),
     ]
-    rows = summary[summary["metric"] == first].to_dict("records")
+    rows = (
+        summary[summary["metric"] == first]
+        .rename(columns={"low": "mean_low", "high": "mean_high"})
+        .to_dict("records")
+    )
+    for row in rows:
+        if row["forecaster"] in ("hold", "offline"):
+            row["recovered"] = None
+        for baseline in baselines:
+            if row["forecaster"] == baseline:
+                row[f"vs_{baseline}"] = None
+    intervals = (METRIC_LABELS.get(first, first), "recovered")
     caption = ", ".join(shared) + "\n\n" if shared else ""
     method = f"\n{summary.attrs['method']}" if "method" in summary.attrs else ""
-    return caption + text_of(Table.of(columns, rows)) + method
-
-
-def _ends(low: str, high: str) -> Callable[[Row], Interval]:
-    return lambda row: (row[low], row[high])
+    return caption + text_of(Table.of(columns, rows), intervals) + method
 
 
 def _against(baseline: str) -> list[Column]:
     """The mean paired difference to a baseline, its p, the sequences better and worse."""
     name = f"vs_{baseline}"
 
-    def unless_it_is_the_baseline(value: Callable[[Row], Any]) -> Callable[[Row], Any]:
-        def of(row: Row) -> Any:
-            is_known = row["forecaster"] != baseline and row[name] == row[name]
-            return value(row) if is_known else None
+    def where_known(text: Callable[[Row], str]) -> Callable[[Row], str | None]:
+        return lambda row: None if is_unknown(row[name]) else text(row)
 
-        return of
-
-    cells: dict[str, tuple[Callable[[Row], Any], Callable[..., str]]] = {
-        f"vs {baseline}": (itemgetter(name), SIGNED),
-        "p": (itemgetter(f"{name}_p"), p_label),
-        "+/-": (lambda row: f"{row[f'{name}_better']}/{row[f'{name}_worse']}", str),
-    }
     return [
-        Column(title, unless_it_is_the_baseline(value), form)
-        for title, (value, form) in cells.items()
+        Column(f"vs {baseline}", name, SIGNED),
+        Column("p", where_known(lambda row: p_label(row[f"{name}_p"]))),
+        Column("+/-", where_known(lambda row: f"{row[f'{name}_better']}/{row[f'{name}_worse']}")),
     ]
 
 
@@ -116,15 +109,14 @@ def fidelity_table(rows: Sequence[FidelityRow] | Sequence[FidelitySummary]) -> s
     """
     each = isinstance(rows[0], FidelityRow)
     labels = [*_REPLAYED, "sequence"] if each else _REPLAYED
-    columns = [Column(key.replace("_", " "), attrgetter(key), is_label=True) for key in labels]
+    columns = [Column(key.replace("_", " "), key, is_label=True) for key in labels]
     if not each:
-        columns.append(Column("sequences", attrgetter("sequences")))
+        columns.append(Column("sequences", "sequences"))
     columns += [
-        Column(title, attrgetter(key), SIGNED if key.startswith("d_") else SCORE)
+        Column(title, key, SIGNED if key.startswith("d_") else SCORE)
         for key, title in _FIDELITY.items()
         if hasattr(rows[0], key)
     ]
     if each:
-        columns.append(Column("parted at", attrgetter("parted")))
-        columns.append(Column("disagree", attrgetter("disagreement"), SCORE))
+        columns += [Column("parted at", "parted"), Column("disagree", "disagreement", SCORE)]
     return text_of(Table.of(columns, rows))

@@ -201,25 +201,33 @@ def _json(document: Any) -> str:
 
 def _times(results: StudyResults) -> Table:
     """A row per trace: how its processing times are distributed."""
-
-    def of_calls(title: str, key: str) -> Column:
-        return Column(title, lambda trace: trace["times"]["calls"].get(key), Number(".1f"))
-
+    rows = [
+        {
+            "trace": trace["trace"],
+            **trace["times"]["calls"],
+            "slower": trace["times"]["slower_than_frames"],
+            "drift": trace["times"]["drift"].get("ratio"),
+            "stalls": len(trace["times"]["stalls"]),
+        }
+        for trace in results.traces
+    ]
+    ms = Number(".1f")
     columns = [
-        Column("trace", lambda trace: printable(trace["trace"]), is_label=True),
-        Column("calls", lambda trace: trace["times"]["calls"]["n"], COUNT),
-        of_calls("median ms", "median_ms"),
-        *(of_calls(key, f"{key}_ms") for key in ("p95", "p99")),
-        of_calls("longest", "max_ms"),
-        Column("slower than frames", lambda trace: trace["times"]["slower_than_frames"], PERCENT),
-        Column("drift", lambda trace: trace["times"]["drift"].get("ratio"), Number(".2f")),
-        Column("stalls", lambda trace: len(trace["times"]["stalls"]), COUNT),
+        Column("trace", "trace", is_label=True),
+        Column("calls", "n", COUNT),
+        Column("median ms", "median_ms", ms),
+        Column("p95", "p95_ms", ms),
+        Column("p99", "p99_ms", ms),
+        Column("longest", "max_ms", ms),
+        Column("slower than frames", "slower", PERCENT),
+        Column("drift", "drift", Number(".2f")),
+        Column("stalls", "stalls", COUNT),
     ]
     caption = (
         "Times of the calls but the initialisations; drift: the last third of the run to the "
         "first; stalls: calls of over ten times the median"
     )
-    return Table.of(columns, results.traces, "times", caption)
+    return Table.of(columns, rows, "times", caption)
 
 
 def _provenance(trace: Mapping[str, Any], digest: str) -> Entry:

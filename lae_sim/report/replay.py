@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections import ChainMap
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
+from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -207,49 +210,33 @@ SWEPT = {"fps": "fps", "latency_scale": "scale"}
 """What a sweep can vary, by its name in reports, with the heading of its column."""
 
 
-@dataclass(frozen=True)
-class _Line:
-    """A line of a table.
-
-    Attributes:
-        label: what it is about.
-        report: of its trace.
-        result: of its forecaster and permitted latency.
-        scores: the result, or a part of it.
-    """
-
-    label: str
-    report: Report
-    result: Report
-    scores: Report
-
-
 _SCORE, _FRAMES = Number(".4f"), Number(".3f", unit=" fr")
-_SIGMA = Column("sigma", lambda line: line.result["sigma"], Number("g"))
+_SIGMA = Column("sigma", "sigma", Number("g"))
+
+Line = ChainMap[str, Any]
+"""What a line of a table shows, then the result that it is from, and the report of the trace."""
 
 
-def _labels(title: str, swept: Sequence[str]) -> list[Column]:
-    return [
-        Column(title, lambda line: line.label, is_label=True),
-        Column("forecaster", lambda line: line.result["forecaster"], is_label=True),
-        *(_of_report(SWEPT[key], key) for key in swept),
-    ]
-
-
-def _of_report(title: str, key: str, form: Callable[..., str] = str) -> Column:
-    return Column(title, lambda line: line.report[key], form)
-
-
-def _of_scores(title: str, key: str, form: Callable[..., str] = _SCORE) -> Column:
-    return Column(title, lambda line: line.scores[key], form)
-
-
-def _shown(reports: Iterable[tuple[str, Report]], shown_sigmas: Sequence[float]) -> Iterator[_Line]:
+def _lines(reports: Iterable[tuple[str, Report]], shown_sigmas: Sequence[float]) -> Iterator[Line]:
     """A line per label and report, forecaster and permitted latency."""
     for label, report in reports:
+        offline = {
+            f"offline_{metric}": score for metric, score in (report["offline"] or {}).items()
+        }
         for result in report["results"]:
             if result["sigma"] in shown_sigmas:
-                yield _Line(label, report, result, result)
+                yield ChainMap({"label": label, **offline}, result, report)
+
+
+def _text(
+    columns: Iterable[Column], lines: Iterable[Line], title: str, swept: Sequence[str]
+) -> str:
+    labels = [
+        Column(title, "label", is_label=True),
+        Column("forecaster", "forecaster", is_label=True),
+        *(Column(SWEPT[key], key) for key in swept),
+    ]
+    return text_of(Table.of([*labels, *columns], lines))
 
 
 def summary_table(
@@ -266,36 +253,26 @@ def summary_table(
         shown_sigmas: permitted latencies to show.
         swept: those of ``SWEPT`` that get a column.
     """
-    columns = _labels("trace", swept)
-    if len(shown_sigmas) > 1 or shown_sigmas != [0.0]:
-        columns.append(_SIGMA)
+    columns = [_SIGMA] if len(shown_sigmas) > 1 or shown_sigmas != [0.0] else []
     for title, metric in (("AUC", "auc"), ("DP@20", "dp20")):
         columns += [
-            _of_scores(title, metric),
-            *_offline_columns(metric),
-            _of_scores("recov.", f"recovered_{metric}", PERCENT),
+            Column(title, metric, _SCORE),
+            Column("offline", f"offline_{metric}", _SCORE),
+            Column("change", partial(_change, metric), CHANGE),
+            Column("recov.", f"recovered_{metric}", PERCENT),
         ]
     if any("mauc" in result for report in reports for result in report["results"]):
-        columns += [_of_scores("mAUC", "mauc"), _of_scores("mDP", "mdp")]
+        columns += [Column("mAUC", "mauc", _SCORE), Column("mDP", "mdp", _SCORE)]
     columns += [
-        _of_report("tracker", "tracker_fps", Number(".1f", unit=" fps")),
-        _of_report("skipped", "skip_rate", PERCENT),
-        _of_scores("mismatch", "mismatch_mean", _FRAMES),
+        Column("tracker", "tracker_fps", Number(".1f", unit=" fps")),
+        Column("skipped", "skip_rate", PERCENT),
+        Column("mismatch", "mismatch_mean", _FRAMES),
     ]
-    return text_of(Table.of(columns, _shown(zip(labels, reports), shown_sigmas)))
+    return _text(columns, _lines(zip(labels, reports), shown_sigmas), "trace", swept)
 
 
-def _offline_columns(metric: str) -> list[Column]:
-    """The offline score, and how far the score is from it."""
-
-    def offline(line: _Line) -> float | None:
-        scores = line.report["offline"]
-        return None if scores is None else scores[metric]
-
-    def change(line: _Line) -> float | None:
-        return relative_change(line.scores[metric], offline(line))
-
-    return [Column("offline", offline, _SCORE), Column("change", change, CHANGE)]
+def _change(metric: str, line: Line) -> float | None:
+    return relative_change(line[metric], line.get(f"offline_{metric}"))
 
 
 def settings_text(report: Report) -> str:
@@ -339,43 +316,37 @@ def attribute_table(
 ) -> str:
     """One line per attribute and forecaster."""
     columns = [
-        *_labels("attribute", swept),
-        _of_scores("sequences", "sequences", str),
+        Column("sequences", "sequences"),
         _SIGMA,
-        _of_scores("AUC", "auc"),
-        _of_scores("recovered", "recovered_auc", PERCENT),
-        _of_scores("DP@20", "dp20"),
+        Column("AUC", "auc", _SCORE),
+        Column("recovered", "recovered_auc", PERCENT),
+        Column("DP@20", "dp20", _SCORE),
     ]
     lines = [
-        replace(line, label=name, scores=scores)
-        for line in _shown([("", report)], shown_sigmas)
-        for name, scores in line.result["attributes"].items()
+        line.new_child({**scores, "label": name})
+        for line in _lines([("", report)], shown_sigmas)
+        for name, scores in line["attributes"].items()
     ]
-    return text_of(Table.of(columns, sorted(lines, key=lambda line: line.label)))
+    return _text(columns, sorted(lines, key=itemgetter("label")), "attribute", swept)
 
 
 def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequence[str] = ()) -> str:
     """One line per sequence and forecaster."""
     columns = [
-        *_labels("sequence", swept),
         _SIGMA,
-        _of_scores("AUC", "auc"),
-        _of_scores("offline", "offline_auc"),
-        _of_scores("DP@20", "dp20"),
-        _of_scores("offline", "offline_dp20"),
-        _of_scores("frames", "world_frames", str),
-        _of_scores("processed", "processed", str),
-        Column(
-            "mismatch",
-            lambda line: line.scores["mismatch_sum"] / line.scores["world_frames"],
-            _FRAMES,
-        ),
-        _of_scores("approximate", "approximate_outputs", str),
-        _of_scores("disagree", "disagreement", PERCENT),
+        Column("AUC", "auc", _SCORE),
+        Column("offline", "offline_auc", _SCORE),
+        Column("DP@20", "dp20", _SCORE),
+        Column("offline", "offline_dp20", _SCORE),
+        Column("frames", "world_frames"),
+        Column("processed", "processed"),
+        Column("mismatch", lambda line: line["mismatch_sum"] / line["world_frames"], _FRAMES),
+        Column("approximate", "approximate_outputs"),
+        Column("disagree", "disagreement", PERCENT),
     ]
     lines = [
-        replace(line, label=scores["sequence"], scores=scores)
-        for line in _shown([("", report)], shown_sigmas)
-        for scores in line.result["per_sequence"]
+        line.new_child({**scores, "label": scores["sequence"]})
+        for line in _lines([("", report)], shown_sigmas)
+        for scores in line["per_sequence"]
     ]
-    return text_of(Table.of(columns, sorted(lines, key=lambda line: line.label)))
+    return _text(columns, sorted(lines, key=itemgetter("label")), "sequence", swept)

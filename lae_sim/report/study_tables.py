@@ -7,8 +7,9 @@ those for a terminal fewer columns.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
@@ -30,13 +31,12 @@ from lae_sim.report.table import (
     PERCENT,
     SCORE,
     SIGNED,
-    UNKNOWN,
     Cell,
     Column,
-    Interval,
     Number,
     Table,
     latex_of,
+    legend_of,
     p_label,
     printable,
     relative_change,
@@ -54,41 +54,21 @@ MOST_PAIRS = 300
 """Comparisons that are shown, at most, before only those of settings that stand for all are."""
 
 
-def _field(key: str) -> Callable[[Row], Any]:
-    """A value of a row, None where the row has none."""
-    return lambda row: row.get(key)
+def _names(keys: Iterable[str]) -> list[Column]:
+    """Columns of names, and of exact numbers, whose values are numbers."""
+    exact = {key: partial(_exact, key) for key in ("scale", "fps")}
+    return [Column(key, exact.get(key, key), is_label=True) for key in keys]
 
 
-def _ends(key: str) -> Callable[[Row], Interval | None]:
-    """The interval of a value of a row."""
-
-    def interval(row: Row) -> Interval | None:
-        low, high = row.get(f"{key}_low"), row.get(f"{key}_high")
-        return None if low is None or high is None else (low, high)
-
-    return interval
+def _exact(key: str, row: Row) -> Cell:
+    return Cell(str(row[key]), eval_scale(str(row[key])))
 
 
-def _number(title: str, key: str, form: Number = SCORE, meaning: str = "") -> Column:
-    """A column of numbers, with their intervals where they have some."""
-    return Column(title, _field(key), form, _ends(key), meaning)
-
-
-def _label(key: str, value: Callable[[Row], object] | None = None) -> Column:
-    """A column of names, or of exact numbers, which are sorted as such."""
-    value = value or _field(key)
-    if key in ("scale", "fps"):
-        return Column(
-            key, lambda row: Cell(str(value(row)), eval_scale(str(value(row)))), is_label=True
-        )
-    return Column(key, lambda row: str(value(row)), is_label=True)
-
-
-def _jitter(row: Row) -> Cell:
-    ends = _ends("auc_jitter")(row)
-    if ends is None:
-        return UNKNOWN
-    return Cell(f"{ends[0]:.3f} to {ends[1]:.3f}", ends[1] - ends[0], ends)
+def _jitter(row: Row) -> Cell | None:
+    if "auc_jitter_low" not in row:
+        return None
+    low, high = row["auc_jitter_low"], row["auc_jitter_high"]
+    return Cell(f"{low:.3f} to {high:.3f}", high - low, (low, high))
 
 
 def _exactness(row: Row) -> Cell:
@@ -96,72 +76,67 @@ def _exactness(row: Row) -> Cell:
     return Cell("exact" if row["exact"] else f"approximate ({100 * share:.3g}%)", share)
 
 
-_COUNT, _RECOVERED = Number(".0f"), Number(".1f", 100, "%", ".0f")
+_COUNT, _MS, _RATIO, _RECOVERED = (
+    Number(".0f"), Number(".1f"), Number(".2f"), Number(".1f", 100, "%", ".0f")
+)  # fmt: skip
 _RANKING = (
-    _number("n", "sequences", _COUNT, "number of sequences"),
-    _number("AUC", "auc", meaning="with its 95 % interval over sequences"),
+    Column("n", "sequences", _COUNT, "number of sequences"),
+    Column("AUC", "auc", SCORE, "with its 95 % interval over sequences"),
     Column("jitter", _jitter, meaning="the range of 95 % of the repetitions' AUC"),
-    _number("offline", "offline_auc", meaning="AUC without latency"),
+    Column("offline", "offline_auc", SCORE, "AUC without latency"),
     Column("change", lambda row: relative_change(row["auc"], row["offline_auc"]), CHANGE,
-           meaning="of the AUC, to offline"),
-    _number("recovered", "recovered_auc", _RECOVERED,
-            "share of the AUC lost to latency that the forecaster wins back"),
-    _number("vs hold", "vs_hold_auc", SIGNED, "AUC won over hold"),
-    Column("p", _field("vs_hold_auc_p"), p_label, meaning="of no difference to hold: Wilcoxon's "
-           "signed-rank test over sequences, not corrected"),
-    _number("DP", "dp20", meaning="precision at 20 px"),
-    _number("offline DP", "offline_dp20", meaning="without latency"),
-    _number("ms/call", "elapsed_ms", Number(".1f"), "mean processing time"),
-    _number("skipped", "skip_rate", PERCENT, "share of frames never processed"),
-    _number("age ms", "age_ms", Number(".0f"), "mean age of the outputs that answer, at the first "
-            "sigma; what forecasting costs is not in it"),
-    _number("stale ms", "longest_stale_ms", Number(".0f"), "longest time that one output answered"),
-    _number("failed", "failed", PERCENT,
-            "share of sequences in which an answer misses the target wholly"),
-    _number("to failure s", "time_to_failure_ms", Number(".1f", 1e-3), "median time to the first "
-            "such answer (Kaplan and Meier); unknown if less than half fail"),
+           "of the AUC, to offline"),
+    Column("recovered", "recovered_auc", _RECOVERED,
+           "share of the AUC lost to latency that the forecaster wins back"),
+    Column("vs hold", "vs_hold_auc", SIGNED, "AUC won over hold"),
+    Column("p", "vs_hold_auc_p", p_label, "of no difference to hold: Wilcoxon's signed-rank test "
+           "over sequences, not corrected"),
+    Column("DP", "dp20", SCORE, "precision at 20 px"),
+    Column("offline DP", "offline_dp20", SCORE, "without latency"),
+    Column("ms/call", "elapsed_ms", _MS, "mean processing time"),
+    Column("skipped", "skip_rate", PERCENT, "share of frames never processed"),
+    Column("age ms", "age_ms", _COUNT, "mean age of the outputs that answer, at the first sigma; "
+           "what forecasting costs is not in it"),
+    Column("stale ms", "longest_stale_ms", _COUNT, "longest time that one output answered"),
+    Column("failed", "failed", PERCENT,
+           "share of sequences in which an answer misses the target wholly"),
+    Column("to failure s", "time_to_failure_ms", Number(".1f", 1e-3), "median time to the first "
+           "such answer (Kaplan and Meier); unknown if less than half fail"),
     Column("front", lambda row: Cell("★" if row["pareto"] else "", int(row["pareto"])),
            meaning="with the same forecaster, no other trace is both faster and better"),
     Column("replay", _exactness,
            meaning="the share of outputs that follow another frame than when recorded"),
-    Column("engine", _field("engine"), meaning="batch, or simpy where policy or latency need it"),
+    Column("engine", "engine", meaning="batch, or simpy where policy or latency need it"),
 )  # fmt: skip
 _PAPER = ("AUC", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")
 _TERMINAL = ("n", "AUC", "jitter", "offline", "recovered", "vs hold", "p", "DP", "ms/call",
-             "skipped", "age ms")  # fmt: skip
+             "skipped", "age ms", "front")  # fmt: skip
 
 
-def _ranked(view: View) -> list[Row]:
-    """The best AUC of each setting first."""
-    keys = ("dataset", *several(view.rows))
-    settings = [tuple(str(row[key]) for key in keys) for row in view.rows]
-    order = {setting: i for i, setting in reversed([*enumerate(settings)])}
-    ranks = [(order[s], -(row["auc"] or 0)) for s, row in zip(settings, view.rows)]
-    return [view.rows[i] for i in sorted(range(len(ranks)), key=ranks.__getitem__)]
+def ranking(
+    view: View, titles: Container[str] | None = None, standing_alone: bool = False
+) -> Table:
+    """A row per trace, setting and forecaster, the best AUC of a setting first.
 
-
-def _ranking_columns(
-    view: View, titles: Container[str], settings: Sequence[str] = ()
-) -> list[Column]:
-    repeated = any("auc_jitter_low" in row for row in view.rows)
-    return [
-        _label("tracker", lambda row: view.names[run_of(row)]),
-        *map(_label, ("forecaster", "dataset", *settings)),
-        *(column for column in _RANKING if column.title in titles
+    Args:
+        view: of a study.
+        titles: of the columns beside names and settings; by default all.
+        standing_alone: whether there are only rows of the settings that stand for all.
+    """
+    settings = several(view.rows)
+    places = [tuple(str(row[key]) for key in ("dataset", *settings)) for row in view.rows]
+    order = {place: i for i, place in reversed([*enumerate(places)])}
+    by_auc = sorted(zip(places, view.rows), key=lambda at: (order[at[0]], -(at[1]["auc"] or 0)))
+    rows = [row for _, row in by_auc if view.stands(row) or not standing_alone]
+    repeated = any("auc_jitter_low" in row for row in rows)
+    columns = [
+        Column("tracker", lambda row: view.names[run_of(row)], is_label=True),
+        *_names(["forecaster", "dataset", *(() if standing_alone else settings)]),
+        *(column for column in _RANKING if (titles is None or column.title in titles)
           and (repeated or column.title != "jitter")),
     ]  # fmt: skip
-
-
-def ranking(view: View, for_paper: bool = False) -> Table:
-    """A row per trace, setting and forecaster, the best AUC of a setting first."""
-    rows = _ranked(view)
-    if for_paper:
-        rows = [row for row in rows if view.stands(row)]
-        caption = f"The best AUC first: {shared_setting(view.standing)}"
-        return Table.of(_ranking_columns(view, _PAPER), rows, "ranking", caption)
-    columns = _ranking_columns(view, {c.title for c in _RANKING}, several(view.rows))
-    caption = f"The best AUC of each setting first: {shared_setting(rows)}"
-    return Table.of(columns, rows, "ranking", caption)
+    first = "The best AUC first" if standing_alone else "The best AUC of each setting first"
+    return Table.of(columns, rows, "ranking", f"{first}: {shared_setting(rows)}")
 
 
 def table2(view: View) -> Table:
@@ -234,36 +209,38 @@ def _with_ranks(
     return tuple(map(tuple, lines))
 
 
-def attribute_table(view: View, for_paper: bool = False) -> Table | None:
-    """A row per attribute, tracker and forecaster; None if there are none."""
+def attribute_table(view: View, pooled: bool = False) -> Table | None:
+    """A row per attribute, tracker and forecaster; None if there are none.
+
+    ``pooled`` keeps the rows of all trackers together, if there are any.
+    """
     if view.attributes is None:
         return None
-    records = view.attributes.to_dict("records")
     keys = ("dataset", "attribute", "trace")
-    offline = {
-        tuple(row[key] for key in keys): row["mean"]
-        for row in records
-        if row["forecaster"] == "offline"
-    }
-    rows = [row for row in records if row["forecaster"] != "offline"]
+    offline, rows = {}, []
+    for row in view.attributes.to_dict("records"):
+        row |= {"auc": row["mean"], "auc_low": row["low"], "auc_high": row["high"]}
+        if row["forecaster"] == "hold":
+            row |= dict.fromkeys(("vs_hold", "vs_hold_p", "recovered"))
+        if row["forecaster"] == "offline":
+            offline[tuple(row[key] for key in keys)] = row["mean"]
+        else:
+            rows.append(row)
     together = [row for row in rows if row["trace"] == ALL_TRACES]
-
-    def against_hold(key: str) -> Callable[[Row], Any]:
-        return lambda row: None if row["forecaster"] == "hold" else row[key]
-
     columns = [
-        _label("dataset"), _label("attribute"),
-        replace(_label("trace"), title="tracker"), _label("forecaster"),
-        _number("n", "sequences", _COUNT),
-        Column("AUC", _field("mean"), SCORE, lambda row: (row["low"], row["high"])),
+        *_names(["dataset", "attribute"]),
+        Column("tracker", "trace", is_label=True),
+        *_names(["forecaster"]),
+        Column("n", "sequences", _COUNT),
+        Column("AUC", "auc", SCORE),
         Column("offline", lambda row: offline.get(tuple(row[key] for key in keys)), SCORE),
-        Column("vs hold", against_hold("vs_hold"), SIGNED, _ends("vs_hold")),
-        Column("p", against_hold("vs_hold_p"), p_label),
-        Column("recovered", against_hold("recovered"), _RECOVERED, _ends("recovered")),
-    ]  # fmt: skip
+        Column("vs hold", "vs_hold", SIGNED),
+        Column("p", "vs_hold_p", p_label),
+        Column("recovered", "recovered", _RECOVERED),
+    ]
     return Table.of(
         columns,
-        (for_paper and together) or rows,
+        (pooled and together) or rows,
         "attributes",
         "AUC on the sequences of each attribute (n of them), at the first sigma; "
         + shared_setting(view.standing, but="sigma"),
@@ -277,35 +254,44 @@ def comparison_table(view: View) -> Table:
         rows = [row for row in rows if view.chosen[row["a"]] == setting_of(row)]
         left_out = f"; {len(view.results.comparisons):,} pairs of all settings are in "
         left_out += "comparisons.csv"
-    keys = _differing(rows, ("dataset", *SETTINGS[1:]))
     columns = [
-        *map(_label, (*keys, "forecaster")),
-        _label("a", lambda row: view.names[row["a"]]),
-        _label("b", lambda row: view.names[row["b"]]),
-        _number("n", "sequences", _COUNT),
-        _number("AUC of a - b", "difference", SIGNED),
-        Column("p", _field("p"), p_label),
-        Column("p (Holm)", _field("p_holm"), p_label),
-        _number("a better here", "better_here", Number(".2f")),
-        _number("a better", "better", Number(".2f")),
+        *_names([*_differing(rows, ("dataset", *SETTINGS[1:])), "forecaster"]),
+        Column("a", lambda row: view.names[row["a"]], is_label=True),
+        Column("b", lambda row: view.names[row["b"]], is_label=True),
+        Column("n", "sequences", _COUNT),
+        Column("AUC of a - b", "difference", SIGNED),
+        Column("p", "p", p_label),
+        Column("p (Holm)", "p_holm", p_label),
+        Column("a better here", "better_here", _RATIO),
+        Column("a better", "better", _RATIO),
     ]
-    return Table.of(columns, rows, "comparisons", f"Trackers against each other{left_out}")
+    table = Table.of(columns, rows, "comparisons", f"Trackers against each other{left_out}")
+    note = (
+        "a better here: probability that one run of a beats one of b on these sequences; "
+        "a better: on others like them. p: Wilcoxon's signed-rank test; Holm: corrected for the "
+        "number of pairs of a setting."
+    )
+    return replace(table, note=note)
 
 
-def required_table(view: View) -> Table:
-    """A row per trace, setting and forecaster: how slow it may be."""
+def required_table(view: View, mark_ends: bool = False) -> Table:
+    """A row per trace, setting and forecaster: how slow it may be.
+
+    ``mark_ends`` tells scales at which the search ended, short of the true one, by ``>=``.
+    """
     rows = view.results.required
-    keys = _differing(rows, ("policy", "fps", "latency", "convention"))
     columns = [
-        _label("trace", run_of),
-        *map(_label, (*keys, "forecaster")),
-        _number("AUC asked", "required_auc", Number(".3g")),
-        _number("without latency", "auc_without_latency"),
-        Column("times at most x", _most, Number(".2f")),
-        _number("AUC there", "auc"),
-        _number("speed-up needed", "speed_up", Number(".2f")),
-        _number("world fps at most", "fps_at_most", Number(".1f")),
-    ]
+        Column("trace", run_of, is_label=True),
+        *_names([*_differing(rows, ("policy", "fps", "latency", "convention")), "forecaster"]),
+        Column("AUC asked", "required_auc", Number(".3g")),
+        Column("without latency", "auc_without_latency", SCORE),
+        Column("times at most x", partial(_most, mark_ends),
+               meaning="by bisection, in steps of 0.01"),
+        Column("AUC there", "auc", SCORE),
+        Column("speed-up needed", "speed_up", _RATIO),
+        Column("world fps at most", "fps_at_most", _MS,
+               "unknown where a cost or a policy has a time of its own"),
+    ]  # fmt: skip
     return Table.of(
         columns,
         rows,
@@ -315,8 +301,11 @@ def required_table(view: View) -> Table:
     )
 
 
-def _most(row: Row) -> float | None:
-    return None if row["scale"] is None else eval_scale(row["scale"])
+def _most(mark_ends: bool, row: Row) -> Cell | None:
+    if row["scale"] is None:
+        return None
+    scale = eval_scale(row["scale"])
+    return Cell(">= " * (mark_ends and not row["beyond"]) + f"{scale:.2f}", scale)
 
 
 def _differing(rows: Iterable[Row], keys: Iterable[str]) -> list[str]:
@@ -340,9 +329,9 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
     compared = comparison_table(view) if results.comparisons else None
     required = required_table(view) if results.required else None
     tables = {  # whole, and for a paper
-        "ranking": (ranking(view), ranking(view, for_paper=True)),
+        "ranking": (ranking(view), ranking(view, _PAPER, standing_alone=True)),
         "table2": (table2(view),) * 2,
-        "attributes": (attribute_table(view), attribute_table(view, for_paper=True)),
+        "attributes": (attribute_table(view), attribute_table(view, pooled=True)),
         "comparisons": (compared, compared),
         "required": (required, required),
     }
@@ -360,15 +349,17 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
 def study_text(results: StudyResults | View) -> str:
     """The tables for a terminal, then what they rest on."""
     view = results if isinstance(results, View) else View(results)
-    results, parts = view.results, [_ranking_text(view)]
+    results, tables = view.results, [ranking(view, _TERMINAL)]
     repeated = any(row["repetitions"] > 1 for row in view.rows)
     if results.comparisons and (repeated or len(results.comparisons) <= 30):
-        parts.append(
-            f"{text_of(comparison_table(view))}\na better here: probability that one run of a "
-            "beats one of b on these sequences; a better: on others like them"
-        )
+        tables.append(comparison_table(view))
     if results.required:
-        parts.append(_required_text(view))
+        tables.append(required_table(view, mark_ends=True))
+    parts = []
+    for table in tables:
+        text = text_of(table, intervals=("AUC", "jitter", "AUC of a - b"))
+        text = text.replace("★", "*")  # not every terminal has stars
+        parts.append("\n".join([table.caption, text, legend_of(table)]))
     lines = [f"{len(results.plan.cells)} cells, {results.computed} of them computed now"]
     approximate = [row["approximate_share"] for row in view.rows if not row["exact"]]
     if approximate:
@@ -378,37 +369,3 @@ def study_text(results: StudyResults | View) -> str:
         )
     lines += [f"not computed: {each['of']}: {each['reason']}" for each in results.failures]
     return "\n\n".join([*parts, "\n".join([*lines, *results.notes()])])
-
-
-def _ranking_text(view: View) -> str:
-    rows = _ranked(view)
-    front = Column("front", lambda row: "*" * row["pareto"])  # not every terminal has stars
-    columns = [
-        column if column.title == "AUC" else replace(column, interval=None)
-        for column in _ranking_columns(view, _TERMINAL, several(view.rows))
-        if column.title != "dataset" or _differing(rows, ["dataset"])
-    ] + [front]
-    return (
-        f"{shared_setting(rows)}\n{text_of(Table.of(columns, rows))}\n"
-        "[ ]: 95 % bootstrap over sequences; jitter: 95 % of the repetitions; p: Wilcoxon's "
-        "signed-rank test;\nn: sequences; front: with this forecaster no other trace is both "
-        "faster and better" + "; age at the first sigma" * bool(rows[0]["sigma"] == MEAN)
-    )
-
-
-def _required_text(view: View) -> str:
-    table, rows = required_table(view), view.results.required
-    at_least = [" " if row["beyond"] is not None else ">=" for row in rows]
-    place = table.header.index("times at most x")
-    cells = [
-        (*row[:place], replace(row[place], text=f"{sign} {row[place].text}"), *row[place + 1 :])
-        if row[place] != UNKNOWN
-        else row
-        for row, sign in zip(table.rows, at_least)
-    ]
-    return (
-        f"{text_of(replace(table, rows=tuple(cells)))}\ntimes at most: by bisection, in steps of "
-        f"0.01; all at sigma {rows[0]['sigma']}; world fps at most: how fast the\nworld may move, "
-        "with the recorded motion from frame to frame (unknown where a cost or a policy has a time "
-        "of its own)"
-    )

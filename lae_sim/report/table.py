@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Iterable, Sequence
+import textwrap
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -93,9 +94,10 @@ class Column:
 
     Attributes:
         title: its heading.
-        value: of a record: a number, a text, None if it is unknown, or a whole `Cell`.
-        form: makes text of a value; numbers may be written with their interval.
-        interval: of a record, or None.
+        value: the name of a value of the record (or mapping), which has an interval if there are
+            ``NAME_low`` and ``NAME_high`` beside it; or a function of the record, which gives a
+            value or a whole `Cell`.
+        form: makes text of a value, and of a value and its interval.
         meaning: what the column holds, where the heading does not say it.
         is_label: whether it names the rows; such columns come first, and are left-aligned.
         group: a heading above this and the neighbouring columns of the same group.
@@ -103,9 +105,8 @@ class Column:
     """
 
     title: str
-    value: Callable[[Any], Any]
+    value: str | Callable[[Any], Any]
     form: Callable[..., str] = printable
-    interval: Callable[[Any], Interval | None] | None = None
     meaning: str = ""
     is_label: bool = False
     group: str = ""
@@ -113,15 +114,20 @@ class Column:
 
     def cell(self, record: Any) -> Cell:
         """What the column shows of a record."""
-        value = self.value(record)
+        value = _get(record, self.value) if isinstance(self.value, str) else self.value(record)
         if isinstance(value, Cell):
             return value
         if is_unknown(value):
             return UNKNOWN
-        interval = self.interval(record) if self.interval else None
-        if interval is None or is_unknown(interval[0]):
+        low, high = _get(record, f"{self.value}_low"), _get(record, f"{self.value}_high")
+        if is_unknown(low):
             return Cell(self.form(value), value)
-        return Cell(self.form(value, interval), value, interval)
+        return Cell(self.form(value, (low, high)), value, (low, high))
+
+
+def _get(record: Any, name: str) -> Any:
+    """A value of a record or a mapping; None if there is none."""
+    return record.get(name) if isinstance(record, Mapping) else getattr(record, name, None)
 
 
 @dataclass(frozen=True)
@@ -133,12 +139,14 @@ class Table:
         caption: what it shows.
         columns: its columns.
         rows: a cell per column.
+        note: what else there is to say.
     """
 
     name: str
     caption: str
     columns: tuple[Column, ...]
     rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
 
     @classmethod
     def of(
@@ -166,9 +174,27 @@ class Table:
         return [(title, len(list(members))) for title, members in groupby(titles)]
 
 
-def text_of(table: Table) -> str:
-    """A table as aligned text, for a terminal."""
-    return aligned(table.header, [[c.text for c in row] for row in table.rows], table.labels)
+def text_of(table: Table, intervals: Container[str] | None = None) -> str:
+    """A table as aligned text, for a terminal.
+
+    Args:
+        table: the table.
+        intervals: titles of the columns that show their intervals; by default all.
+    """
+
+    def text(column: Column, cell: Cell) -> str:
+        left_out = cell.interval and intervals is not None and column.title not in intervals
+        return column.form(cell.value) if left_out else cell.text
+
+    lines = [[*map(text, table.columns, row)] for row in table.rows]
+    return aligned(table.header, lines, table.labels)
+
+
+def legend_of(table: Table) -> str:
+    """What the columns mean, in lines that fit a terminal."""
+    parts = [f"{column.title}: {column.meaning}" for column in table.columns if column.meaning]
+    text = "; ".join(parts + [table.note] * bool(table.note))
+    return textwrap.fill(text, 100, break_on_hyphens=False)
 
 
 def aligned(header: Sequence[str], lines: Sequence[Sequence[str]], labels: int = 2) -> str:

@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
@@ -129,19 +129,16 @@ def _range(taken: Any, figure: Callable[[Any], float]) -> str:
 
 def _times(times: Mapping[str, Any]) -> list[str]:
     names = ("mean_ms", "median_ms", "p90_ms", "p95_ms", "p99_ms", "max_ms", "fps")
-
-    def figure(name: str) -> Column:
-        return Column(name.removesuffix("_ms"), lambda kind: times[kind].get(name), _figure)
-
     columns = [
-        Column("times, ms", str, is_label=True),
-        Column("n", lambda kind: times[kind]["n"], COUNT),
-        *map(figure, names),
+        Column("times, ms", "kind", is_label=True),
+        Column("n", "n", COUNT),
+        *(Column(name.removesuffix("_ms"), name, _figure) for name in names),
     ]
-    kinds = [kind for kind in ("calls", "initialisations") if times[kind]["n"]]
+    kinds = [{**times[kind], "kind": kind} for kind in ("calls", "initialisations")]
+    table = Table.of(columns, [each for each in kinds if each["n"]])
     share, interval = 100 * times["slower_than_frames"], _figure(times["frame_interval_ms"])
     late = f"{share:.3g}% of the calls take longer than the interval between frames, {interval} ms"
-    return [*text_of(Table.of(columns, kinds)).splitlines(), late]
+    return [*text_of(table).splitlines(), late]
 
 
 def _figure(value: float) -> str:
@@ -192,14 +189,16 @@ def _stalls(stalls: list[dict[str, Any]]) -> list[str]:
 
 def profile_table(passes: Sequence[PassSummary]) -> str:
     """What a profile's passes left: a line per trace."""
-    columns = [Column("trace", attrgetter("trace"), is_label=True)]
-    counts = {"sequences": "sequences", "frames": "world_frames", "processed": "processed"}
-    columns += [
-        Column(title, attrgetter(key), COUNT) for title, key in {**counts, "lost": "lost"}.items()
-    ]
-    columns += [
-        Column(key.replace("_", " "), attrgetter(key), Number(".2f"))
-        for key in ("init_ms", "median_ms", "p95_ms")
+    ms = Number(".2f")
+    columns = [
+        Column("trace", "trace", is_label=True),
+        Column("sequences", "sequences", COUNT),
+        Column("frames", "world_frames", COUNT),
+        Column("processed", "processed", COUNT),
+        Column("lost", "lost", COUNT),
+        Column("init ms", "init_ms", ms),
+        Column("median ms", "median_ms", ms),
+        Column("p95 ms", "p95_ms", ms),
     ]
     return text_of(Table.of(columns, passes))
 
