@@ -23,8 +23,11 @@ def explained(what: str) -> Iterator[None]:
     except LaeError:
         raise
     except Exception as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        message = " ".join(str(error).split())[:300]
-        raise LaeError(
-            f"{what}: {type(error).__name__}: {message} ({last.filename}, line {last.lineno})"
-        ) from error
+        raise LaeError(f"{what}: {described(error)}") from error
+
+
+def described(error: BaseException) -> str:
+    """An error that was caught, in one line: its type, its message and where it was raised."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    message = " ".join(str(error).split())[:300]
+    return f"{type(error).__name__}: {message} ({last.filename}, line {last.lineno})"

@@ -83,10 +83,10 @@ def test_ortrack_on_visdrone(
     source = scaled(by_frame, Fraction(factor))
     runs = [replay_sequence(recording, CLOCK, source) for recording in ortrack]
     found = evaluate(runs, METADATA, FORECASTERS)
-    assert len(found.sequences) == 20
-    assert found.frames.sum() == 19_433
-    assert found.processed.sum() == processed
-    assert found.mismatch_sum.sum() == mismatch
+    assert len(found.replay.sequences) == 20
+    assert found.replay.frames.sum() == 19_433
+    assert found.replay.processed.sum() == processed
+    assert found.staleness.mismatch_sum.sum() == mismatch
     assert means(found) == {"hold": hold, "kalman": kalman}
     assert found.offline["auc"].mean().round(4) == 0.5147
     assert found.offline["dp20"].mean().round(4) == 0.7189
@@ -95,9 +95,9 @@ def test_ortrack_on_visdrone(
 def test_nanotrack_on_dtb70_at_47_ms(nanotrack: Trace) -> None:
     runs = [replay_sequence(recording, CLOCK) for recording in nanotrack]
     found = evaluate(runs, METADATA, FORECASTERS)
-    assert len(found.sequences) == 70
-    assert found.processed.sum() == 11_226
-    assert found.mismatch_sum.sum() == 40_315
+    assert len(found.replay.sequences) == 70
+    assert found.replay.processed.sum() == 11_226
+    assert found.staleness.mismatch_sum.sum() == 40_315
     assert means(found) == {"hold": (0.4233, 0.5566), "kalman": (0.5300, 0.7221)}
     assert found.offline["auc"].mean().round(3) == 0.628
     assert found.offline["dp20"].mean().round(3) == 0.815

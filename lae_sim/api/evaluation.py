@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,9 +20,9 @@ from lae_sim.engine.clock import Number, exact
 from lae_sim.engine.scheduler import Policy
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
-from lae_sim.evaluation.evaluate import Evaluation, answers
-from lae_sim.evaluation.evaluate import evaluate as evaluate_runs
+from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
+from lae_sim.evaluation.totals import Totals
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.learning.registry import find_camera, load_forecaster
@@ -29,7 +31,8 @@ from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import TraceLike, World, label_of
 from lae_sim.report import figures
-from lae_sim.report.replay import attribute_members, trace_report
+from lae_sim.report.export import sigma_text
+from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
 from lae_sim.trace.file import Trace
 
 if TYPE_CHECKING:
@@ -59,13 +62,21 @@ class Scenario:
 
     def evaluate(
         self,
-        observers: Sequence[Callable[[Run], None]] = (),
+        *,
+        attributes: bool = True,
+        sequences: bool = True,
+        curves_at: Fraction | None = None,
+        observers: Sequence[Observer] = (),
+        observed: Collection[tuple[str, Fraction]] = (),
         progress: Callable[[int], object] = lambda frames: None,
     ) -> Evaluated:
         """Replay and score.
 
         Args:
-            observers: each is given every run as it passes.
+            attributes: whether to keep the scores of the dataset's attributes apart.
+            sequences: whether to keep the scores of each sequence.
+            curves_at, observers, observed: see
+                :func:`lae_sim.evaluation.evaluate.evaluate_groups`.
             progress: called with the world frames of each run.
         """
         metadata, convention = self.trace.metadata, find_convention(self.world.convention)
@@ -73,18 +84,31 @@ class Scenario:
         if self.world.latency == "recorded" and self.world.timing is None:
             observers = [*observers, stalls]
 
-        def observed() -> Iterator[Run]:
+        def runs() -> Iterator[Run]:
             for run in self.runs:
-                for observe in observers:
-                    observe(run)
                 yield run
                 progress(len(run))
 
-        evaluation = evaluate_runs(
-            observed(), metadata, self.forecasters, self.world.sigmas, convention, self.costs
-        )
-        notes = notes_on(evaluation, metadata, convention, self.forecasters)
-        return Evaluated(self, evaluation, (*notes, *stalls.notes(), *cost_notes(self.costs)))
+        names = list(self.forecasters)
+        totals, rows = Totals(names.index("hold")), SequenceRows(names)
+        for part in evaluate_groups(
+            runs(),
+            metadata,
+            self.forecasters,
+            self.world.sigmas,
+            convention,
+            self.costs,
+            curves_at=curves_at,
+            observers=observers,
+            observed=observed,
+        ):
+            named = part.replay.sequences if attributes else ()
+            totals.add(part, attribute_members(metadata, named))
+            if sequences:
+                rows.add(part)
+        notes = notes_on(totals.replay, metadata, convention, self.forecasters)
+        notes += [*stalls.notes(), *cost_notes(self.costs)]
+        return Evaluated(self, totals, rows, tuple(notes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +117,14 @@ class Evaluated:
 
     Attributes:
         scenario: what was replayed and scored.
-        evaluation: its scores.
+        totals: its scores over all sequences, and over those of each attribute.
+        rows: the scores of each sequence, if they were kept.
         notes: what keeps the scores from being what they seem, a sentence each.
     """
 
     scenario: Scenario
-    evaluation: Evaluation
+    totals: Totals
+    rows: SequenceRows
     notes: tuple[str, ...]
 
     def document(self, attributes: bool = False, per_sequence: bool = False) -> dict[str, Any]:
@@ -107,14 +133,13 @@ class Evaluated:
         metadata, runs = scenario.trace.metadata, scenario.runs
         path = path_of(scenario.trace, scenario.label)
         times = runs.trace if runs.timing is None else runs.timing
-        members = attribute_members(metadata, self.evaluation.sequences) if attributes else None
         return {
             "trace": path,
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
             "device": metadata.device,
-            "strided": [path_of(trace, "open trace") for trace in runs.passes],
-            "times_from": path if runs.timing is None else path_of(runs.timing, "open trace"),
+            "strided": [path_of(trace, "an open trace") for trace in runs.passes],
+            "times_from": path if runs.timing is None else path_of(runs.timing, "an open trace"),
             "times_note": times.metadata.timing_note,
             "fps": str(runs.clock.fps),
             "policy": label_of(world.policy),
@@ -124,13 +149,13 @@ class Evaluated:
             "forecaster_cost_ns": dict(scenario.costs),
             "notes": list(self.notes),
             **trace_report(
-                self.evaluation,
+                self.totals,
                 runs.clock,
                 list(scenario.forecasters),
                 world.sigmas,
                 world.convention,
-                members,
-                per_sequence,
+                self.rows if per_sequence else None,
+                attributes,
             ),
         }
 
@@ -252,28 +277,10 @@ class EvaluationResult:
 
         tables = []
         for part in self.parts:
-            evaluation, world = part.evaluation, part.scenario.world
-            axes = [
-                list(part.scenario.forecasters),
-                evaluation.sequences,
-                [float(sigma) for sigma in world.sigmas],
-            ]
-            index = pd.MultiIndex.from_product(axes, names=["forecaster", "sequence", "sigma"])
-            shape = tuple(map(len, axes))
-
-            def spread(values: Any, shape: tuple[int, ...] = shape) -> Any:
-                return np.broadcast_to(values, shape).ravel()
-
-            frames = evaluation.frames[:, None]
-            columns = {metric: evaluation.scores[metric].ravel() for metric in METRICS}
-            for metric in METRICS:
-                columns[f"offline_{metric}"] = spread(evaluation.offline[metric][:, None])
-            columns["world_frames"] = spread(frames)
-            columns["processed"] = spread(evaluation.processed[:, None])
-            columns["approximate_outputs"] = spread(evaluation.departures[:, None])
-            columns["mismatch_mean"] = spread(evaluation.mismatch_sum / frames)
-            table = pd.DataFrame(columns, index).reset_index()
-            tables.append(table.assign(**_setting(part.scenario)))
+            sigmas = [float(sigma) for sigma in part.scenario.world.sigmas]
+            for scored in part.rows.parts:
+                table = _sequence_table(scored, list(part.scenario.forecasters), sigmas)
+                tables.append(table.assign(**_setting(part.scenario)))
         joined = pd.concat(tables, ignore_index=True)
         first = [*SETTING, "sequence", "forecaster", "sigma"]
         return joined[[*first, *joined.columns.difference(first, sort=False)]]
@@ -389,11 +396,34 @@ def _setting(scenario: Scenario) -> dict[str, Any]:
     return dict(zip(SETTING, values))
 
 
+def _sequence_table(
+    scored: Evaluation, forecasters: Sequence[str], sigmas: Sequence[float]
+) -> DataFrame:
+    """The scores of some sequences: a row per forecaster, sequence and permitted latency."""
+    import pandas as pd
+
+    replay, axes = scored.replay, [forecasters, scored.replay.sequences, sigmas]
+    index = pd.MultiIndex.from_product(axes, names=["forecaster", "sequence", "sigma"])
+    frames = replay.frames[:, None]
+    columns: dict[str, Any] = {metric: scored.scores[metric] for metric in METRICS}
+    columns |= {f"offline_{metric}": scored.offline[metric][:, None] for metric in METRICS}
+    columns |= {
+        "world_frames": frames,
+        "processed": replay.processed[:, None],
+        "approximate_outputs": replay.departures[:, None],
+        "mismatch_mean": scored.staleness.mismatch_sum / frames,
+    }
+    shape = tuple(map(len, axes))
+    flat = {name: np.broadcast_to(values, shape).ravel() for name, values in columns.items()}
+    return pd.DataFrame(flat, index).reset_index()
+
+
 def _exactness(part: Evaluated) -> list[str]:
-    departures = int(part.evaluation.departures.sum())
-    calls = int((part.evaluation.processed - 1).sum())
+    replay = part.totals.replay
+    departures = int(replay.departures.sum())
     if not departures:
         return []
+    calls = int((replay.processed - 1).sum())
     return [
         f"approximate: {100 * departures / calls:.3g}% of the outputs follow another frame than "
         "when recorded; a tracker that searches near its last answer would do worse"
@@ -412,7 +442,7 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
     at = first.world.sigmas[0] if sigma is None else sigma
     traces = list(dict.fromkeys(part.scenario.label for part in parts))
     title = "" if len(traces) > 1 else f"{first.label}: "
-    title += f"sigma {at}, convention {first.world.convention}"
+    title += f"sigma {sigma_text(at)}, convention {first.world.convention}"
     reports = [part.document() for part in parts]
     swept = [key for key in ("fps", "latency_scale") if len({each[key] for each in reports}) > 1]
     if swept:
@@ -420,8 +450,8 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
         return figures.sweep_figure(reports, names, float(at), swept, title)
     curves = {}
     for part in parts:
-        prefix = f"{part.scenario.label}: " if len(traces) > 1 else ""
-        found = figures.mean_curves(part.evaluation, part.scenario.forecasters)
+        prefix = f"{Path(part.scenario.label).with_suffix('')}: " if len(traces) > 1 else ""
+        found = figures.mean_curves(part.totals.curves, list(part.scenario.forecasters))
         curves.update({prefix + name: curve for name, curve in found.items()})
     return figures.success_and_precision(curves, title)
 
@@ -505,31 +535,23 @@ def evaluate(
         dataset=dataset,
         camera_lag=camera_lag,
     )
-    return EvaluationResult(tuple(evaluated(asked, progress)))
+    with scenario_bar(asked, progress) as advance:
+        return EvaluationResult(tuple(scenario.evaluate(progress=advance) for scenario in asked))
 
 
-def evaluated(
-    asked: Sequence[Scenario],
-    show: bool | None = None,
-    observers: Sequence[Callable[[Run], None]] = (),
-) -> list[Evaluated]:
-    """Replay and score scenarios one after another, with a progress bar.
-
-    Args:
-        asked: what to replay and score.
-        show: whether to show the bar; by default on a terminal and in a notebook.
-        observers: each is given every run as it passes.
-    """
+@contextmanager
+def scenario_bar(
+    asked: Sequence[Scenario], show: bool | None = None
+) -> Iterator[Callable[[int], object]]:
+    """A progress bar over the world frames of scenarios, and what moves it by so many frames."""
     known = [scenario.trace.frames for scenario in asked]
     total = None if None in known else sum(map(int, known))  # type: ignore[arg-type]
-    done, found = 0, []
+    done = 0
     with ProgressBar("replay", "frames", show) as bar:
 
         def advance(frames: int) -> None:
             nonlocal done
             done += frames
-            bar(done, total, scenario.label)
+            bar(done, total)
 
-        for scenario in asked:
-            found.append(scenario.evaluate(observers, advance))
-    return found
+        yield advance

@@ -79,7 +79,7 @@ def score_forecasters(
             setting = {"latency": label_of(world.latency), "scale": float(world.scale)}
             tables.append(rows.assign(trace=label, dataset=dataset, **setting))
             notes += _notes(f"{label}, {world.label()}", evaluation, costs)
-        about = notes_on(evaluation, trace.metadata, convention, ready)
+        about = notes_on(evaluation.replay, trace.metadata, convention, ready)
         notes += [f"{label}: {note}" for note in about]
     return _joined(tables, notes)
 
@@ -134,9 +134,9 @@ def steps(
 def _notes(where: str, found: Evaluation, costs: Mapping[str, int]) -> list[str]:
     """What keeps the figures of one replay from being what they seem."""
     notes = []
-    calls = int(found.processed.sum()) - len(found.sequences)
-    if found.departures.any():
-        share = 100 * found.departures.sum() / calls
+    calls = int(found.replay.processed.sum()) - len(found.replay.sequences)
+    if found.replay.departures.any():
+        share = 100 * found.replay.departures.sum() / calls
         notes.append(
             f"{where}: approximate, {share:.3g}% of the outputs follow another frame than when "
             "recorded"
@@ -148,14 +148,13 @@ def _rows(found: Evaluation, forecasters: Sequence[str], sigmas: Sequence[Fracti
     """The scores of one replay: sequence, forecaster, sigma, metric and value."""
     import pandas as pd
 
-    count, sequences = len(sigmas), len(found.sequences)
+    sequences, count = found.replay.sequences, len(sigmas)
+    shape = 1, len(sequences), count
     values = [
-        np.concatenate(
-            [found.scores[m], np.broadcast_to(found.offline[m][:, None], (1, sequences, count))]
-        )
+        np.concatenate([found.scores[m], np.broadcast_to(found.offline[m][:, None], shape)])
         for m in METRICS
     ]
-    axes = [METRICS, [*forecasters, OFFLINE], found.sequences, [float(sigma) for sigma in sigmas]]
+    axes = [METRICS, [*forecasters, OFFLINE], sequences, [float(sigma) for sigma in sigmas]]
     index = pd.MultiIndex.from_product(axes, names=["metric", "forecaster", "sequence", "sigma"])
     return pd.DataFrame({"value": np.stack(values).ravel()}, index).reset_index()
 

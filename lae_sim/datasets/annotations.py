@@ -224,16 +224,16 @@ def _annotation_folder(root: Path) -> Path:
             continue
         if _flat(folder):
             return folder
-        found = {path.name: path for path in _folders(folder) if _flat(path)}
-        if root.resolve().name in found:
-            return found[root.resolve().name]
-        if len(found) > 1:
+        inner = {path.name: path for path in _folders(folder) if _flat(path)}
+        if root.resolve().name in inner:
+            return inner[root.resolve().name]
+        if len(inner) > 1:
             raise LaeError(
-                f"{folder}: holds the ground truth of {', '.join(found)}; give one of them, "
-                f"such as {next(iter(found.values()))}"
+                f"{folder}: holds the ground truth of {', '.join(inner)}; give one of them, "
+                f"such as {next(iter(inner.values()))}"
             )
-        if found:
-            return next(iter(found.values()))
+        if inner:
+            return next(iter(inner.values()))
     return root
 
 

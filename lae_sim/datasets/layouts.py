@@ -80,9 +80,9 @@ def find_dataset(
     if root is None:
         if name not in (None, "synthetic"):
             raise LaeError(f"give the folder of {name} with --root; only synthetic needs none")
-        made = {sequence.name: sequence for sequence in synthetic_dataset().sequences}
-        chosen = _choose(sequences, made, "the synthetic dataset")
-        return Dataset("synthetic", fps or Fraction(30), [made[name] for name in chosen])
+        synthetic = {sequence.name: sequence for sequence in synthetic_dataset().sequences}
+        chosen = _choose(sequences, synthetic, "the synthetic dataset")
+        return Dataset("synthetic", fps or Fraction(30), [synthetic[name] for name in chosen])
     root = Path(root)
     if root.is_file() or box is not None:
         return _without_truth(name, root, sequences, box, fps)
@@ -92,11 +92,11 @@ def find_dataset(
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
-    found = [
+    chosen_sequences = [
         _sequence(root, sequence, truth.files[sequence], attributes.get(sequence, ()))
         for sequence in _choose(sequences, truth.files, str(root), truth.match)
     ]
-    return Dataset(name, fps or Fraction(_FPS.get(name, 30)), found)
+    return Dataset(name, fps or Fraction(_FPS.get(name, 30)), chosen_sequences)
 
 
 def _without_truth(
@@ -217,19 +217,19 @@ def _only_first(first: Floats, length: int) -> Floats:
 
 def _choose(
     wanted: Sequence[str] | None,
-    known: Iterable[str],
+    available: Iterable[str],
     where: str,
     match: Callable[[str], str | None] = lambda name: None,
 ) -> list[str]:
-    """The wanted names of those known, in their order; all of them if none is named."""
-    names = list(known)
+    """The wanted names of those available, in their order; all of them if none is named."""
+    names = list(available)
     chosen = set()
     for name in wanted or ():
-        found = name if name in names else match(name)
-        if found is None:
+        matching = name if name in names else match(name)
+        if matching is None:
             close = difflib.get_close_matches(name, names) or names[:3]
             raise LaeError(
                 f"{where}: no sequence {name!r} among {len(names)}; there is {', '.join(close)}"
             )
-        chosen.add(found)
+        chosen.add(matching)
     return [name for name in names if not wanted or name in chosen]

@@ -106,7 +106,7 @@ def _sequence(scene: _Scene) -> ImageSequence:
     area, ratio = truth[:, 2:].prod(axis=1), truth[:, 2] / truth[:, 3]
     corners = np.clip(truth[:, None, :2] + truth[:, None, 2:] * [[0], [1]], 0, _SIZE)
     visible = (corners[:, 1] - corners[:, 0]).prod(axis=1) / area
-    shown = {
+    difficulties = {
         "Scale variation": area.max() / area.min() > 2.5,
         "Aspect ratio variation": max(ratio.max() / ratio[0], ratio[0] / ratio.min()) > 2,
         "Occlusion": scene.covers > 0,
@@ -119,7 +119,7 @@ def _sequence(scene: _Scene) -> ImageSequence:
         "Motion blur": scene.exposure > 0,
     }
     truth[visible < 0.25] = np.nan
-    attributes = tuple(name for name, holds in shown.items() if holds)
+    attributes = tuple(name for name, holds in difficulties.items() if holds)
     return ImageSequence(scene.name, truth, partial(_read, scene), attributes)
 
 

@@ -8,15 +8,19 @@ no more than these two say so by a second method, :class:`LanePolicy`.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, TypeVar
 
 import numpy as np
 
 from lae_sim._arrays import Ints
 from lae_sim.engine.clock import Clock, duration_ns
 from lae_sim.engine.scheduler import Call, Policy
+
+Frames = TypeVar("Frames", int, Ints)
+"""Frames or ticks: of one sequence, or int64 [lanes]."""
 
 
 class LanePolicy(Protocol):
@@ -41,53 +45,56 @@ def _start(clock: Clock, now: int, frame: int) -> tuple[int, int]:
     return frame, now if now > arrival else arrival
 
 
-@dataclass(frozen=True)
-class _Latest:
+def _later(a: Frames, b: Frames) -> Frames:
+    """The greater of two frames, or of each two."""
+    if type(a) is int:  # np.maximum on two numbers takes as long as the rest of the engine
+        return a if a > b else b
+    greater: Frames = np.maximum(a, b)
+    return greater
+
+
+class _ByLastCall(ABC):
+    """A policy by a rule that is the same for one sequence, in Python's integers, and for lanes.
+
+    Numbers are no lane of one: they have any size, and take 1.4 us a call where an array of one
+    takes 4.3.
+    """
+
+    @abstractmethod
+    def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
+        """As in :class:`LanePolicy`; of numbers, a number."""
+
     def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         last, _, now = calls[-1]
-        newest = now // clock.frame_ticks
-        if newest > last:
-            return newest, now
-        return last + 1, (last + 1) * clock.frame_ticks
-
-    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
-        following: Ints = now // clock.frame_ticks
-        return np.maximum(following, last + 1, out=following)
+        return _start(clock, now, self.next_lanes(clock, last, now))
 
 
 @dataclass(frozen=True)
-class _Every:
+class _Latest(_ByLastCall):
+    def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
+        return _later(now // clock.frame_ticks, last + 1)
+
+
+@dataclass(frozen=True)
+class _Every(_ByLastCall):
     n: int
 
-    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
-        last, _, now = calls[-1]
-        return _start(clock, now, last + self.n)
-
-    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
+    def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
         return last + min(self.n, _BEYOND)
 
 
 @dataclass(frozen=True)
-class _ShrinkingTail:
+class _ShrinkingTail(_ByLastCall):
     expected_ns: int
 
-    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
-        last, _, now = calls[-1]
+    def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
         interval = clock.frame_ticks
         newest = now // interval
-        expected = self.expected_ns * clock.ticks_per_ns
-        waits = expected > interval and (now + expected) % interval < now % interval
-        return _start(clock, now, newest + 1 if waits else max(newest, last + 1))
-
-    def next_lanes(self, clock: Clock, last: Ints, now: Ints) -> Ints:
-        interval = clock.frame_ticks
-        newest = now // interval
-        following: Ints = np.maximum(newest, last + 1)
         expected = self.expected_ns * clock.ticks_per_ns
         if expected > interval:  # tails shrink where adding the expected one reaches an arrival
             waits = now - newest * interval >= interval - expected % interval
-            following = np.where(waits, newest + 1, following)
-        return following
+            newest = newest + waits
+        return _later(newest, last + 1)
 
 
 _BEYOND = 2**40  # no sequence has so many frames

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lae_sim.evaluation.evaluate import Evaluation
+from lae_sim.evaluation.evaluate import ReplayStatistics, ScoredRun
 from lae_sim.evaluation.metrics import Convention
 from lae_sim.forecast.base import AnyFactory, notes_of
-from lae_sim.replay.run import Run
 from lae_sim.trace.describe import STALL
 from lae_sim.trace.metadata import Metadata
 
@@ -22,8 +21,9 @@ class SkippedStalls:
     def __init__(self) -> None:
         self._count = self._longest_ns = 0
 
-    def __call__(self, run: Run) -> None:
+    def __call__(self, scored: ScoredRun) -> None:
         """Take in a run."""
+        run = scored.run
         skipped = run.recording.elapsed_ns.copy()
         typical = np.median(skipped[skipped >= 0])
         skipped[run.schedule.frames] = -1
@@ -42,31 +42,31 @@ class SkippedStalls:
 
 
 def notes_on(
-    evaluation: Evaluation,
+    replay: ReplayStatistics,
     metadata: Metadata,
     convention: Convention,
     forecasters: Mapping[str, AnyFactory],
 ) -> list[str]:
     """What to say of the scores of a trace, a sentence each."""
     notes = []
-    sequences = evaluation.sequences
-    bare = [n for n, i, t in zip(sequences, evaluation.frames, evaluation.truthless) if i == t]
-    if evaluation.truthless.any():
+    sequences = replay.sequences
+    bare = [n for n, i, t in zip(sequences, replay.frames, replay.truthless) if i == t]
+    if replay.truthless.any():
         counted = "leaves them out" if convention.leaves_out else "counts them as missed by AUC"
         counted += "" if convention.leaves_out else " and hit by DP"
         notes.append(
-            f"{evaluation.truthless.sum():,} frames have no ground truth; {convention.name} "
+            f"{replay.truthless.sum():,} frames have no ground truth; {convention.name} "
             + counted
             + (f"; {len(bare)} sequences have none at all, such as {bare[0]!r}" if bare else "")
         )
-    if evaluation.missing.any():
-        which = "the trace lacks" if evaluation.missing.all() else "some sequences lack"
+    if replay.missing.any():
+        which = "the trace lacks" if replay.missing.all() else "some sequences lack"
         notes.append(f"no offline score, nothing recovered: {which} the boxes of skipped frames")
-    if not evaluation.scores_latency.all():
+    if not replay.scores_latency.all():
         notes.append("vot-realtime skips frames but never scores latency")
-    parted = np.flatnonzero(evaluation.disagreement > TRUSTED_DISAGREEMENT)
+    parted = np.flatnonzero(replay.disagreement > TRUSTED_DISAGREEMENT)
     if len(parted):
-        worst = sequences[int(np.nanargmax(evaluation.disagreement))]
+        worst = sequences[int(np.nanargmax(replay.disagreement))]
         notes.append(
             f"do not trust the replay of {len(parted)} of {len(sequences)} sequences, such as "
             f"{worst!r}: the passes disagree on more than {TRUSTED_DISAGREEMENT:.0%} of its frames"

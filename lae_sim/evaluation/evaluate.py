@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from fractions import Fraction
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
@@ -18,12 +19,17 @@ from lae_sim.replay.run import Run
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
 
+Record = TypeVar("Record", "Staleness", "Curves")
+
+PairedBoxes: TypeAlias = "tuple[Histories, Pairs, Floats]"
+"""Histories, their pairs with frames, and the box of each pair, float64 [P, 4]."""
+
 _PART = 1 << 19  # outputs that forecasters are fed at once
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
-    """Scores of S sequences, F forecasters and M permitted latencies.
+class ReplayStatistics:
+    """How S sequences were replayed, whatever was forecast.
 
     Attributes:
         sequences: names, S of them.
@@ -37,17 +43,6 @@ class Evaluation:
         init_ns: time of the initialisation, int64 [S].
         calls_ns: total time of the other calls, int64 [S].
         calls_hz: sum of 1/elapsed over the other calls, per second, [S]; infinite if one took 0.
-        mismatch_sum, mismatch_max: of i - psi(i), frames, int64 [S, M].
-        longest_hold: most queries in a row with one answering output, frames, int64 [S, M].
-        scores: per metric of ``METRICS``, float64 [F, S, M] in 0..1; NaN = leaves the mean.
-        failure: the first world frame whose answer does not overlap the truth at all, int64
-            [F, S, M]; the number of world frames if there is none.
-        success: over the convention's IoU thresholds at the first sigma, float64 [F, S, N]; NaN as
-            in the scores.
-        precision: over 0, 1, ..., 50 px at the first sigma, float64 [F, S, 51].
-        offline: per metric, of the trace's boxes at their own frames, float64 [S]; NaN where the
-            trace does not hold every frame.
-        offline_success, offline_precision: their curves, float64 [S, N] and [S, 51].
     """
 
     sequences: tuple[str, ...]
@@ -61,166 +56,99 @@ class Evaluation:
     init_ns: Ints
     calls_ns: Ints
     calls_hz: Floats
+
+    @classmethod
+    def joined(cls, parts: Sequence[ReplayStatistics]) -> ReplayStatistics:
+        """Those of some groups of sequences as one."""
+        names = tuple(name for part in parts for name in part.sequences)
+        columns = {
+            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(cls)
+            if field.name != "sequences"
+        }
+        return cls(sequences=names, **columns)
+
+    def chosen(self, which: Ints) -> ReplayStatistics:
+        """Those of some sequences, by their indices."""
+        columns = {
+            field.name: getattr(self, field.name)[which]
+            for field in fields(self)
+            if field.name != "sequences"
+        }
+        return ReplayStatistics(sequences=tuple(self.sequences[s] for s in which), **columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Staleness:
+    """How old the answers are in S sequences at M permitted latencies; i - psi(i) is the mismatch.
+
+    Attributes:
+        mismatch_sum, mismatch_max: over the world frames, frames, int64 [S, M].
+        longest_hold: most queries in a row with one answering output, frames, int64 [S, M].
+    """
+
     mismatch_sum: Ints
     mismatch_max: Ints
     longest_hold: Ints
-    scores: Mapping[str, Floats]
-    failure: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Shares of frames over thresholds; NaN where the sequence leaves the mean.
+
+    Attributes:
+        success: over the convention's IoU thresholds, float64 [..., N].
+        precision: over 0, 1, ..., 50 px, float64 [..., 51].
+    """
+
     success: Floats
     precision: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Scores of S sequences, F forecasters and M permitted latencies.
+
+    Attributes:
+        replay: how the sequences were replayed.
+        staleness: how old the answers are, where forecasts cost nothing.
+        scores: per metric of ``METRICS``, float64 [F, S, M] in 0..1; NaN = leaves the mean.
+        failure: the first world frame whose answer does not overlap the truth at all, int64
+            [F, S, M]; the number of world frames if there is none.
+        curves: at one permitted latency, [F, S, ...].
+        offline: per metric, of the trace's boxes at their own frames, float64 [S]; NaN where the
+            trace does not hold every frame.
+        offline_curves: likewise, [S, ...].
+    """
+
+    replay: ReplayStatistics
+    staleness: Staleness
+    scores: Mapping[str, Floats]
+    failure: Ints
+    curves: Curves
     offline: Mapping[str, Floats]
-    offline_success: Floats
-    offline_precision: Floats
+    offline_curves: Curves
 
     @classmethod
     def joined(cls, parts: Sequence[Evaluation]) -> Evaluation:
         """The evaluations of some groups of sequences as one."""
-        by_forecaster = ("failure", "success", "precision")
-        columns = {
-            field.name: np.concatenate(
-                [getattr(part, field.name) for part in parts], axis=int(field.name in by_forecaster)
-            )
-            for field in fields(cls)
-            if field.name not in ("sequences", "scores", "offline")
-        }
         return cls(
-            sequences=tuple(name for part in parts for name in part.sequences),
+            replay=ReplayStatistics.joined([part.replay for part in parts]),
+            staleness=_joined([part.staleness for part in parts]),
             scores={m: np.concatenate([p.scores[m] for p in parts], axis=1) for m in METRICS},
+            failure=np.concatenate([part.failure for part in parts], axis=1),
+            curves=_joined([part.curves for part in parts], axis=1),
             offline={m: np.concatenate([p.offline[m] for p in parts]) for m in METRICS},
-            **columns,
+            offline_curves=_joined([part.offline_curves for part in parts]),
         )
 
 
-def evaluate(
-    runs: Iterable[Run],
-    metadata: Metadata,
-    forecasters: Mapping[str, AnyFactory],
-    sigmas: Sequence[Fraction] = (Fraction(0),),
-    convention: Convention = PYSOT,
-    costs: Mapping[str, int] | None = None,
-) -> Evaluation:
-    """Score the runs of one trace, in groups, so that memory does not grow with the trace.
-
-    Args:
-        runs: one per sequence, all of one clock.
-        metadata: of the trace, for image sizes.
-        forecasters: factories by name.
-        sigmas: distinct permitted latencies in frames, ascending.
-        convention: how frames and thresholds count.
-        costs: what an answer costs, ns, by forecaster; 0 if not named. It delays the answers.
-
-    Raises:
-        LaeError: if there is no run or no forecaster, or whatever iterating over the runs raises.
-    """
-    parts = list(evaluate_groups(runs, metadata, forecasters, sigmas, convention, costs))
-    if not parts:
-        raise LaeError("there is nothing to evaluate: no sequences")
-    return Evaluation.joined(parts)
-
-
-def evaluate_groups(
-    runs: Iterable[Run],
-    metadata: Metadata,
-    forecasters: Mapping[str, AnyFactory],
-    sigmas: Sequence[Fraction] = (Fraction(0),),
-    convention: Convention = PYSOT,
-    costs: Mapping[str, int] | None = None,
-    frames: int = BATCH_ROWS,
-) -> Iterator[Evaluation]:
-    """The same, group after group of sequences, for those who keep less than all of it.
-
-    The larger the groups (of about ``frames`` world frames), the faster, and the more memory.
-    """
-    if not forecasters:
-        raise LaeError("name at least one forecaster, such as hold")
-    alone: dict[Recording, _Alone] = {}
-    for group in batched(runs, frames):
-        alone = _alone([run.recording for run in group], convention, alone)
-        yield _evaluate_group(group, metadata, forecasters, sigmas, convention, costs or {}, alone)
-
-
-@dataclass(frozen=True, eq=False)
-class _Alone:
-    """What scores have of a recording alone, however it is replayed."""
-
-    truthless: int
-    missing: int
-    offline: Sequence[float]
-    success: Floats
-    precision: Floats
-
-
-def _alone(
-    recordings: Iterable[Recording], convention: Convention, known: Mapping[Recording, _Alone]
-) -> dict[Recording, _Alone]:
-    """Those of some recordings; those of the group before may be the same, replayed again."""
-    found = {recording: known.get(recording) for recording in recordings}
-    new = [recording for recording, value in found.items() if value is None]
-    if new:
-        offline = Scorer(new, convention).offline()
-        scores = np.stack([offline.scores[metric][:, 0] for metric in METRICS], axis=1).tolist()
-        for r, recording in enumerate(new):
-            truth, boxes = recording.truth[:, 0], recording.boxes[:, 0]
-            missing = int(np.isnan(truth).sum()), int(np.isnan(boxes).sum())
-            curves = offline.success[r], offline.precision[r]
-            found[recording] = _Alone(*missing, scores[r], *curves)
-    return {recording: value for recording, value in found.items() if value is not None}
-
-
-def _evaluate_group(
-    runs: Sequence[Run],
-    metadata: Metadata,
-    forecasters: Mapping[str, AnyFactory],
-    sigmas: Sequence[Fraction],
-    convention: Convention,
-    costs: Mapping[str, int],
-    alone: Mapping[Recording, _Alone],
-) -> Evaluation:
-    """Score some runs at once."""
-    schedules = [run.schedule for run in runs]
-    needed = {0, *(costs.get(name, 0) for name in forecasters)}
-    pairings = {cost: pair(schedules, sigmas, cost) for cost in needed}
-    pairing = pairings[0]
-    scorer = Scorer([run.recording for run in runs], convention)
-    scored = [
-        scorer.of(
-            _answers(runs, metadata, pairings[costs.get(name, 0)], name, factory), len(sigmas)
-        )
-        for name, factory in forecasters.items()
-    ]
-    fixed = [alone[run.recording] for run in runs]
-    offline = np.array([each.offline for each in fixed])
-    elapsed = [run.schedule.elapsed_ns for run in runs]
-    return Evaluation(
-        sequences=tuple(run.recording.name for run in runs),
-        frames=pairing.lengths,
-        truthless=np.array([each.truthless for each in fixed], np.int64),
-        missing=np.array([each.missing for each in fixed], np.int64),
-        processed=np.diff(pairing.offsets),
-        scores_latency=np.array([schedule.scores_latency for schedule in schedules]),
-        departures=np.array([run.departures for run in runs], np.int64),
-        disagreement=np.array([run.disagreement for run in runs]),
-        init_ns=np.array([each[0] for each in elapsed], np.int64),
-        calls_ns=np.array([each[1:].sum() for each in elapsed], np.int64),
-        calls_hz=np.array([_rates(each[1:]).sum() for each in elapsed]),
-        mismatch_sum=pairing.mismatch_sum,
-        mismatch_max=pairing.mismatch_max,
-        longest_hold=pairing.longest_hold,
-        scores={m: np.stack([each.scores[m] for each in scored]) for m in METRICS},
-        failure=np.stack([each.failure for each in scored]),
-        success=np.stack([each.success for each in scored]),
-        precision=np.stack([each.precision for each in scored]),
-        offline=dict(zip(METRICS, offline.T)),
-        offline_success=np.stack([each.success for each in fixed]),
-        offline_precision=np.stack([each.precision for each in fixed]),
-    )
-
-
-def _rates(elapsed_ns: Ints) -> Floats:
-    """Frames per second of each call, infinite for one that took no time."""
-    rates = np.full(len(elapsed_ns), np.inf)
-    np.divide(1e9, elapsed_ns, out=rates, where=elapsed_ns > 0)
-    return rates
+def _joined(records: Sequence[Record], axis: int = 0) -> Record:
+    """Records of arrays alone as one."""
+    first = records[0]
+    names = [field.name for field in fields(first)]
+    columns = ([getattr(record, name) for record in records] for name in names)
+    return type(first)(*(np.concatenate(column, axis) for column in columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +164,226 @@ class Answers:
     boxes: Floats
 
 
+@dataclass(frozen=True, eq=False)
+class ScoredRun:
+    """A run that is being scored, for those who write down more than its scores.
+
+    Attributes:
+        run: the sequence.
+        answers: those that were asked for, by forecaster and permitted latency.
+    """
+
+    run: Run
+    answers: Mapping[tuple[str, Fraction], Answers]
+    _place: int
+    _sigmas: Sequence[Fraction]
+    _pairings: Mapping[int, Pairing]
+
+    def pairing(self, sigma: Fraction, cost_ns: int = 0) -> Pairing:
+        """Its pairing at one of the sigmas, at a cost that some forecaster has, or at none."""
+        return self._pairings[cost_ns].chosen(self._place, self._sigmas.index(sigma))
+
+
+Observer: TypeAlias = "Callable[[ScoredRun], object]"
+"""``observer(scored)`` takes a run that is being scored, each in its turn."""
+
+
+def evaluate(
+    runs: Iterable[Run],
+    metadata: Metadata,
+    forecasters: Mapping[str, AnyFactory],
+    sigmas: Sequence[Fraction] = (Fraction(0),),
+    convention: Convention = PYSOT,
+    costs: Mapping[str, int] | None = None,
+) -> Evaluation:
+    """Score the runs of one trace, in groups, so that no more than the scores is kept.
+
+    Args:
+        runs: one per sequence, all of one clock.
+        metadata: of the trace, for image sizes.
+        forecasters: factories by name.
+        sigmas: distinct permitted latencies in frames, ascending.
+        convention: how frames and thresholds count.
+        costs: what an answer costs, ns, by forecaster; 0 if not named. It delays the answers.
+
+    Raises:
+        LaeError: if there is no run or no forecaster, or whatever iterating over the runs raises.
+    """
+    groups = evaluate_groups(runs, metadata, forecasters, sigmas, convention, costs)
+    return Evaluation.joined(list(groups))
+
+
+def evaluate_groups(
+    runs: Iterable[Run],
+    metadata: Metadata,
+    forecasters: Mapping[str, AnyFactory],
+    sigmas: Sequence[Fraction] = (Fraction(0),),
+    convention: Convention = PYSOT,
+    costs: Mapping[str, int] | None = None,
+    frames: int = BATCH_ROWS,
+    curves_at: Fraction | None = None,
+    observers: Sequence[Observer] = (),
+    observed: Collection[tuple[str, Fraction]] = (),
+) -> Iterator[Evaluation]:
+    """The same, group after group of sequences, for those who keep less than all of it.
+
+    Args:
+        runs, metadata, forecasters, sigmas, convention, costs: see :func:`evaluate`.
+        frames: about how many world frames are scored at once: the more, the faster, and the more
+            memory.
+        curves_at: the sigma of the success and precision curves; the first by default.
+        observers: take each run, in order, once its group is scored.
+        observed: the answers that they look at, by forecaster and sigma.
+
+    Raises:
+        LaeError: as :func:`evaluate`.
+    """
+    if not forecasters:
+        raise LaeError("name at least one forecaster, such as hold")
+    scoring = _Scoring(
+        metadata,
+        forecasters,
+        sigmas,
+        convention,
+        costs or {},
+        0 if curves_at is None else sigmas.index(curves_at),
+        observers,
+        observed,
+    )
+    offline: dict[Recording, _Offline] = {}
+    for group in batched(runs, frames):
+        offline = _offline([run.recording for run in group], convention, offline)
+        yield scoring.of(group, [offline[run.recording] for run in group])
+    if not offline:
+        raise LaeError("there is nothing to evaluate: no sequences")
+
+
+@dataclass(frozen=True, eq=False)
+class _Offline:
+    """What is scored of a recording alone, however it is replayed.
+
+    Attributes:
+        truthless, missing: see :class:`ReplayStatistics`.
+        scores: in the order of ``METRICS``.
+        success, precision: see :class:`Curves`.
+    """
+
+    truthless: int
+    missing: int
+    scores: Sequence[float]
+    success: Floats
+    precision: Floats
+
+
+def _offline(
+    recordings: Iterable[Recording], convention: Convention, known: Mapping[Recording, _Offline]
+) -> dict[Recording, _Offline]:
+    """Those of some recordings; those of the group before may be the same, replayed again."""
+    scored = {recording: known.get(recording) for recording in recordings}
+    new = [recording for recording, value in scored.items() if value is None]
+    if new:
+        offline = Scorer(new, convention).offline()
+        scores = np.stack([offline.scores[metric][:, 0] for metric in METRICS], axis=1).tolist()
+        for r, recording in enumerate(new):
+            truth, boxes = recording.truth[:, 0], recording.boxes[:, 0]
+            missing = int(np.isnan(truth).sum()), int(np.isnan(boxes).sum())
+            curves = offline.success[r], offline.precision[r]
+            scored[recording] = _Offline(*missing, scores[r], *curves)
+    return {recording: value for recording, value in scored.items() if value is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class _Scoring:
+    """How groups of runs are scored: the arguments of :func:`evaluate_groups`."""
+
+    metadata: Metadata
+    forecasters: Mapping[str, AnyFactory]
+    sigmas: Sequence[Fraction]
+    convention: Convention
+    costs: Mapping[str, int]
+    curves_at: int
+    observers: Sequence[Observer]
+    observed: Collection[tuple[str, Fraction]]
+
+    def of(self, runs: Sequence[Run], offline: Sequence[_Offline]) -> Evaluation:
+        """Score some runs at once."""
+        schedules = [run.schedule for run in runs]
+        costs = {name: self.costs.get(name, 0) for name in self.forecasters}
+        pairings = {
+            cost: pair(schedules, self.sigmas, cost) for cost in sorted({0, *costs.values()})
+        }
+        scorer = Scorer([run.recording for run in runs], self.convention)
+        kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs]
+        scored = []
+        for name, factory in self.forecasters.items():
+            pairing = pairings[costs[name]]
+            parts = _answers(runs, self.metadata, pairing, name, factory)
+            parts = self._observed(parts, pairing, name, kept)
+            scored.append(scorer.of(parts, len(self.sigmas), self.curves_at))
+        for place, run in enumerate(runs if self.observers else ()):
+            one = ScoredRun(run, kept[place], place, self.sigmas, pairings)
+            for observer in self.observers:
+                observer(one)
+        return Evaluation(
+            replay=_replay_statistics(runs, offline, pairings[0]),
+            staleness=Staleness(
+                pairings[0].mismatch_sum, pairings[0].mismatch_max, pairings[0].longest_hold
+            ),
+            scores={m: np.stack([each.scores[m] for each in scored]) for m in METRICS},
+            failure=np.stack([each.failure for each in scored]),
+            curves=Curves(
+                np.stack([each.success for each in scored]),
+                np.stack([each.precision for each in scored]),
+            ),
+            offline=dict(zip(METRICS, np.array([each.scores for each in offline]).T)),
+            offline_curves=Curves(
+                np.stack([each.success for each in offline]),
+                np.stack([each.precision for each in offline]),
+            ),
+        )
+
+    def _observed(
+        self,
+        parts: Iterable[PairedBoxes],
+        pairing: Pairing,
+        name: str,
+        kept: Sequence[dict[tuple[str, Fraction], Answers]],
+    ) -> Iterator[PairedBoxes]:
+        """The parts as they pass, and the answers among them that observers look at."""
+        wanted = [sigma for forecaster, sigma in self.observed if forecaster == name]
+        for part in parts:
+            for sigma in wanted:
+                for place, one in _answers_at(self.sigmas.index(sigma), pairing, part):
+                    kept[place][name, sigma] = one
+            yield part
+
+
+def _replay_statistics(
+    runs: Sequence[Run], offline: Sequence[_Offline], pairing: Pairing
+) -> ReplayStatistics:
+    elapsed = [run.schedule.elapsed_ns for run in runs]
+    return ReplayStatistics(
+        sequences=tuple(run.recording.name for run in runs),
+        frames=pairing.lengths,
+        truthless=np.array([each.truthless for each in offline], np.int64),
+        missing=np.array([each.missing for each in offline], np.int64),
+        processed=np.diff(pairing.offsets),
+        scores_latency=np.array([run.schedule.scores_latency for run in runs]),
+        departures=np.array([run.departures for run in runs], np.int64),
+        disagreement=np.array([run.disagreement for run in runs]),
+        init_ns=np.array([each[0] for each in elapsed], np.int64),
+        calls_ns=np.array([each[1:].sum() for each in elapsed], np.int64),
+        calls_hz=np.array([_rates(each[1:]).sum() for each in elapsed]),
+    )
+
+
+def _rates(elapsed_ns: Ints) -> Floats:
+    """Frames per second of each call, infinite for one that took no time."""
+    rates = np.full(len(elapsed_ns), np.inf)
+    np.divide(1e9, elapsed_ns, out=rates, where=elapsed_ns > 0)
+    return rates
+
+
 def answers(
     run: Run,
     metadata: Metadata,
@@ -246,8 +394,23 @@ def answers(
 ) -> Answers:
     """What a forecaster answers for every world frame of one run."""
     pairing = pair([run.schedule], [sigma], cost_ns)
-    ((fed, found, boxes),) = _answers([run], metadata, pairing, name, factory)
-    return Answers(pairing.frames[fed.output[found.item]], boxes)
+    (part,) = _answers([run], metadata, pairing, name, factory)
+    ((_, only),) = _answers_at(0, pairing, part)
+    return only
+
+
+def _answers_at(m: int, pairing: Pairing, part: PairedBoxes) -> Iterator[tuple[int, Answers]]:
+    """Each sequence of a part, by its index in the pairing, with its answers at one sigma."""
+    fed, paired, boxes = part
+    # at one sigma the pairs of a sequence stand together, and their frames ascend from 0
+    at = np.flatnonzero((paired.sigma_from <= m) & (m < paired.sigma_to))
+    item = paired.item.take(at)
+    sequence = np.repeat(fed.sequence, np.diff(fed.offsets)).take(item)
+    source_frame = pairing.frames.take(fed.output.take(item))
+    answered = boxes.take(at, axis=0)
+    begins = np.flatnonzero(np.diff(sequence, prepend=-1)).tolist()
+    for begin, end in zip(begins, [*begins[1:], len(at)]):
+        yield int(sequence[begin]), Answers(source_frame[begin:end], answered[begin:end])
 
 
 def lanes_of(runs: Sequence[Run], pairing: Pairing, fed: Histories, image_sizes: Floats) -> Lanes:
@@ -271,7 +434,7 @@ def _answers(
     pairing: Pairing,
     name: str,
     factory: AnyFactory,
-) -> Iterator[tuple[Histories, Pairs, Floats]]:
+) -> Iterator[PairedBoxes]:
     """The distinct pairs of a forecaster with their boxes, float64 [P, 4], in parts.
 
     Parts are of whole sequences. Where sigmas share no history there may be 51 times the outputs,

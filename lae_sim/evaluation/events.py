@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
-from lae_sim.evaluation.pairing import pair
+from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.replay.run import Run
 
 KINDS = (
@@ -36,13 +36,21 @@ class Event(NamedTuple):
     source_frame: int | None = None
 
 
-def event_log(run: Run, sigma: Fraction = Fraction(0)) -> list[Event]:
+def event_log(
+    run: Run, sigma: Fraction = Fraction(0), pairing: Pairing | None = None
+) -> list[Event]:
     """All events of a run, for queries at one permitted latency.
 
     Within one tick frames arrive first, then come the tracker's events as it made them, then
     queries. A frame is skipped at the moment when a newer one starts, or at the end of the stream.
+
+    Args:
+        run: one replayed sequence.
+        sigma: permitted latency of the queries, frames.
+        pairing: of the run at that sigma, where it is known already.
     """
-    events = [*_world(run), *_tracker(run), *_queries(run, sigma)]
+    queries = _queries(run, sigma, pairing or pair([run.schedule], [sigma]))
+    events = [*_world(run), *_tracker(run), *queries]
     return sorted(events, key=lambda event: event.tick)  # stable: each stream is in causal order
 
 
@@ -66,8 +74,7 @@ def _tracker(run: Run) -> Iterator[Event]:
         yield Event(schedule.length * schedule.clock.frame_ticks, "frame skipped", skipped)
 
 
-def _queries(run: Run, sigma: Fraction) -> Iterator[Event]:
-    pairing = pair([run.schedule], [sigma])
+def _queries(run: Run, sigma: Fraction, pairing: Pairing) -> Iterator[Event]:
     interval = run.schedule.clock.frame_ticks
     spans = zip(pairing.frames.tolist(), pairing.first[:, 0].tolist(), pairing.end[:, 0].tolist())
     for source, first, end in spans:

@@ -59,6 +59,22 @@ class Pairing:
     first: Frames
     end: Frames
 
+    def chosen(self, sequence: int, sigma: int) -> Pairing:
+        """That of one sequence at one of the permitted latencies, by their indices."""
+        outputs = slice(self.offsets[sequence], self.offsets[sequence + 1])
+        sigmas = slice(sigma, sigma + 1)
+        return Pairing(
+            self.lengths[sequence : sequence + 1],
+            self.offsets[sequence : sequence + 2] - self.offsets[sequence],
+            self.frames[outputs],
+            self.steps[outputs],
+            self.next_steps[outputs],
+            self.scale,
+            self.sigmas[sigmas],
+            self.first[outputs, sigmas],
+            self.end[outputs, sigmas],
+        )
+
     @property
     def mismatch_sum(self) -> Ints:
         """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""

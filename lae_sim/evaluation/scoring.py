@@ -54,14 +54,17 @@ class Scorer:
             counted = np.add.reduceat(valid.astype(np.int64), self._bases)
         self._counted = np.where(counted > 0, counted, np.nan)
 
-    def of(self, parts: Iterable[tuple[Histories, Pairs, Floats]], count: int) -> Scored:
-        """Score paired answers for so many sigmas."""
+    def of(
+        self, parts: Iterable[tuple[Histories, Pairs, Floats]], count: int, curves_at: int = 0
+    ) -> Scored:
+        """Score paired answers for so many sigmas, with the curves at one of them."""
         return self._scored(
             (
                 (np.repeat(fed.sequence, np.diff(fed.offsets)).take(found.item), found, boxes)
                 for fed, found, boxes in parts
             ),
             count,
+            curves_at,
         )
 
     def offline(self) -> Scored:
@@ -75,9 +78,11 @@ class Scorer:
             values[missing] = np.nan
         return scored
 
-    def _scored(self, parts: Iterable[tuple[Ints, Pairs, Floats]], count: int) -> Scored:
+    def _scored(
+        self, parts: Iterable[tuple[Ints, Pairs, Floats]], count: int, curves_at: int = 0
+    ) -> Scored:
         """Score answers, each part with the sequence of each pair, int64 [P]."""
-        tally = _Tally(self._lengths, count, self._convention.thresholds)
+        tally = _Tally(self._lengths, count, curves_at, self._convention.thresholds)
         for sequence, found, boxes in parts:
             for begin in range(0, len(boxes), _CHUNK):
                 now = slice(begin, begin + _CHUNK)
@@ -93,16 +98,16 @@ class Scorer:
             bests = ("auc", "within50", "norm_auc", "norm_auc")
             for metric, best in zip(METRICS, bests):
                 scores[metric] = np.where(tally.sums[best] > 0, scores[metric], np.nan)
-            success[np.isnan(scores["auc"][:, 0])] = np.nan
-            precision[np.isnan(scores["dp20"][:, 0])] = np.nan
+            success[np.isnan(scores["auc"][:, curves_at])] = np.nan
+            precision[np.isnan(scores["dp20"][:, curves_at])] = np.nan
         return Scored(scores, tally.failure, success, precision)
 
 
 class _Tally:
     """Sums of what pairs count, by sequence and sigma."""
 
-    def __init__(self, lengths: Ints, count: int, thresholds: int) -> None:
-        self._count, self._sequences = count, len(lengths)
+    def __init__(self, lengths: Ints, count: int, curves_at: int, thresholds: int) -> None:
+        self._count, self._curves_at = count, curves_at
         names = (*METRICS, "within50")
         self.sums = {name: np.zeros((len(lengths), count), np.int64) for name in names}
         self.failure = np.repeat(lengths[:, None], count, axis=1)
@@ -131,14 +136,16 @@ class _Tally:
             for name in packed:
                 self.sums[name][here] += sums & (1 << bits) - 1
                 sums >>= bits
-        first = np.flatnonzero(found.sigma_from == 0)
-        of_first = local.take(first)
+        shown = np.flatnonzero(
+            (found.sigma_from <= self._curves_at) & (self._curves_at < found.sigma_to)
+        )
+        of_shown = local.take(shown)
         for curves, passed in (
             (self.success, counts.success),
             (self.precision[:, ::-1], counts.precision),
         ):
             shape = len(here), curves.shape[1]
-            curves[here] += _above(of_first, passed.take(first).astype(np.int64), *shape)
+            curves[here] += _above(of_shown, passed.take(shown).astype(np.int64), *shape)
         self._note_failures(sequence, found, np.flatnonzero(counts.apart))
 
     def _note_failures(self, sequence: Ints, found: Pairs, lost: Ints) -> None:

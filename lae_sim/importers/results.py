@@ -143,19 +143,19 @@ def find_results(path: Path, wanted: str = "auto", repetition: int = 1) -> tuple
     """
     if not path.exists():
         raise LaeError(f"{path}: no such file or folder of results")
-    found = _by_format(path, repetition)
+    by_format = _by_format(path, repetition)
     if wanted != "auto":
         kind = "text" if wanted in ("got10k", "pytracking", "ope") else wanted
-        found = {kind: found[kind]} if kind in found else {}
-    if not found:
+        by_format = {kind: by_format[kind]} if kind in by_format else {}
+    if not by_format:
         raise LaeError(
             f"{path}: no results found{'' if wanted == 'auto' else f' of format {wanted}'}; looked "
             "for <seq>.txt, <seq>/<seq>_001.txt, .mat, .npz and .pkl files; give the folder of "
             "one tracker"
         )
-    if len(found) > 1:
-        raise LaeError(f"{path}: holds {' and '.join(found)} results; say which with --format")
-    [(kind, sources)] = found.items()
+    if len(by_format) > 1:
+        raise LaeError(f"{path}: holds {' and '.join(by_format)} results; say which with --format")
+    [(kind, sources)] = by_format.items()
     if kind == "text":
         kind = wanted if wanted != "auto" else _text_format(sources)
     return kind, sorted(sources, key=lambda source: source.name)
@@ -259,7 +259,7 @@ def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | 
 
 
 def _by_format(path: Path, repetition: int) -> dict[str, list[Source]]:
-    found: dict[str, list[Source]] = {}
+    by_format: dict[str, list[Source]] = {}
     if path.is_file():
         files = [path]
     else:
@@ -269,18 +269,18 @@ def _by_format(path: Path, repetition: int) -> dict[str, list[Source]]:
         for file in repeated:
             if file.is_file():
                 times = _first_file(file.with_name(f"{file.parent.name}_time.txt"))
-                found.setdefault("text", []).append(Source(file.parent.name, file, times))
+                by_format.setdefault("text", []).append(Source(file.parent.name, file, times))
     for file in files:
         kind = _SUFFIXES.get(file.suffix.lower())
         if kind == "npz":
-            found.setdefault(kind, []).extend(Source(name, file) for name in _npz_names(file))
+            by_format.setdefault(kind, []).extend(Source(name, file) for name in _npz_names(file))
         elif kind:
-            found.setdefault(kind, []).append(Source(file.stem, file))
+            by_format.setdefault(kind, []).append(Source(file.stem, file))
         elif file.suffix.lower() == ".txt" and not file.stem.endswith(_NOT_BOXES):
             name = f"{file.stem}_time{file.suffix}"
             times = _first_file(file.with_name(name), file.parent / "times" / name)
-            found.setdefault("text", []).append(Source(file.stem, file, times))
-    return found
+            by_format.setdefault("text", []).append(Source(file.stem, file, times))
+    return by_format
 
 
 def _first_file(*paths: Path) -> Path | None:

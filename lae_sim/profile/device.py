@@ -46,15 +46,15 @@ def describe_device(root: str | os.PathLike[str] = "/") -> Facts:
 
 def source_version() -> Facts:
     """``version`` of lae_sim and, in a git checkout, its ``commit`` and whether ``modified``."""
-    found: Facts = {"version": __version__}
+    version: Facts = {"version": __version__}
     checkout = Path(__file__).resolve().parents[2]
     if (checkout / ".git").exists():  # a wheel may lie inside a checkout of something else
         git = "git", "--no-optional-locks", "-C", str(checkout)
         commit = output(*git, "rev-parse", "HEAD")
         changes = output(*git, "status", "--porcelain", "--", "lae_sim")
         if commit and changes is not None:
-            found.update(commit=commit.strip(), modified=bool(changes))
-    return found
+            version.update(commit=commit.strip(), modified=bool(changes))
+    return version
 
 
 def _model(at: Path) -> str:
@@ -81,8 +81,8 @@ def _gpu(at: Path) -> Facts:
     if chip := tegra(at):
         return {"name": f"{chip}, integrated"}
     name, driver, mebibytes = nvidia_smi(at, "name", "driver_version", "memory.total")
-    found = gathered(memory_bytes=lambda: int(mebibytes) * 2**20)
-    return {"name": name, "driver": driver, **found}
+    memory = gathered(memory_bytes=lambda: int(mebibytes) * 2**20)
+    return {"name": name, "driver": driver, **memory}
 
 
 def _power_mode(at: Path) -> str:
@@ -133,7 +133,7 @@ def readings(root: str | os.PathLike[str] = "/") -> Facts:
         root: the folder that system files are read under.
     """
     at = Path(root)
-    found = gathered(
+    reading = gathered(
         time=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"),
         cpu_mhz=lambda: _cpu_mhz(at),
         gpu_mhz=lambda: _devfreq_mhz(at),
@@ -142,9 +142,9 @@ def readings(root: str | os.PathLike[str] = "/") -> Facts:
         throttle_events=lambda: _throttle_events(at),
         discrete=lambda: _discrete_gpu(at),
     )
-    for key, value in found.pop("discrete", {}).items():
-        found[key] = {**found.get(key, {}), **value} if isinstance(value, dict) else value
-    return found
+    for key, value in reading.pop("discrete", {}).items():
+        reading[key] = {**reading.get(key, {}), **value} if isinstance(value, dict) else value
+    return reading
 
 
 def text(path: Path) -> str:
@@ -159,8 +159,8 @@ def text(path: Path) -> str:
 
 def number(path: Path) -> int | None:
     """The whole number that a system file holds."""
-    found = re.match(r"-?\d{1,18}\Z", text(path))
-    return int(found[0]) if found else None
+    digits = re.match(r"-?\d{1,18}\Z", text(path))
+    return int(digits[0]) if digits else None
 
 
 def matched(content: str | None, pattern: str) -> str | None:

@@ -26,6 +26,7 @@ from lae_sim.forecast.base import AnyFactory, Forecaster, factory_for
 from lae_sim.profile.timed import Answer, TimedTracker
 from lae_sim.replay.strides import phases
 from lae_sim.trace.recording import Recording
+from lae_sim.trackers.protocol import checked_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +151,7 @@ class Live:
         box = sequence.truth[0]
         if not (np.isfinite(box).all() and (box[2:] > 0).all()):
             raise LaeError(
-                f"sequence {sequence.name!r}: its first box is {_told(box)}, and a tracker needs "
+                f"sequence {sequence.name!r}: its first box is {_text(box)}, and a tracker needs "
                 "one with a width and a height"
             )
         if pre_forecaster is not None and not tracker.sets_search:
@@ -159,7 +160,7 @@ class Live:
         self._tracker = tracker
         self._pre_forecaster = pre_forecaster
         self._keep_size = keep_size
-        self._found: Sequence[float] = box.tolist()
+        self._last_box: Sequence[float] = box.tolist()
         self._forecaster: Forecaster | None = None
         self._service = service
         self._include_decode = include_decode
@@ -206,12 +207,12 @@ class Live:
             x, y, w, h = self._forecaster.predict(frame)
             spent = perf_counter_ns() - before
             if self._keep_size:
-                _, _, last_w, last_h = self._found
+                _, _, last_w, last_h = self._last_box
                 x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
             search = search_of([x, y, w, h], self._size)
         answer = self._tracker.track(image, search)
         if answer.box is not None:
-            self._found = answer.box
+            self._last_box = answer.box
             with explained("the pre-forecaster"):
                 before = perf_counter_ns()
                 self._forecaster.update(frame, answer.box)
@@ -220,15 +221,14 @@ class Live:
         return answer
 
     def _check(self, frame: int, image: Image) -> None:
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            raise LaeError(f"a frame must be uint8 [H, W, 3], not {image.dtype} {image.shape}")
+        checked_frame(image)
         size = image.shape[1], image.shape[0]
         if frame == 0:
             self._size = size
             x, y, w, h = self._sequence.truth[0]
             if x >= size[0] or y >= size[1] or x + w <= 0 or y + h <= 0:
                 raise LaeError(
-                    f"the first box {_told(self._sequence.truth[0])} lies outside the "
+                    f"the first box {_text(self._sequence.truth[0])} lies outside the "
                     f"{size[0]}x{size[1]} image"
                 )
         elif size != self._size:
@@ -242,10 +242,10 @@ class Live:
         length = len(self._sequence)
         boxes, elapsed = np.full((length, 4), np.nan), np.full(length, -1, np.int64)
         scores = np.full(length, np.nan, np.float32)
-        found: list[Sequence[float]] = []
+        held: list[Sequence[float]] = []  # where nothing was found, the box before stands
         for answer in self._answers:
-            found.append(found[-1] if answer.box is None else answer.box)
-        boxes[frames] = found
+            held.append(held[-1] if answer.box is None else answer.box)
+        boxes[frames] = held
         elapsed[frames] = self._elapsed_ns
         scores[frames] = [np.nan if a.score is None else a.score for a in self._answers]
         return LiveRun(
@@ -269,7 +269,7 @@ def search_of(box: Sequence[float], size: tuple[int, int]) -> list[float]:
     """
     x, y, w, h = (float(value) for value in box)
     if not np.isfinite((x, y, w, h)).all():
-        raise LaeError(f"the pre-forecaster predicted {_told([x, y, w, h])}, not a box")
+        raise LaeError(f"the pre-forecaster predicted {_text([x, y, w, h])}, not a box")
     width, height = size
     return [
         min(max(x + w / 2, 0.0), float(width)),
@@ -279,5 +279,5 @@ def search_of(box: Sequence[float], size: tuple[int, int]) -> list[float]:
     ]
 
 
-def _told(box: Sequence[float] | Floats) -> str:
+def _text(box: Sequence[float] | Floats) -> str:
     return ", ".join(f"{value:g}" for value in box)

@@ -29,7 +29,7 @@ Timing = Callable[[ImageSequence], Service]
 """``timing(sequence)`` makes the service that times a sequence."""
 
 Progress = Callable[[int], object]
-"""``progress(frames)`` is told how many more world frames are done."""
+"""``progress(frames)`` is called with how many more world frames are done."""
 
 
 @dataclass(frozen=True)
@@ -102,15 +102,15 @@ def parse_timing(text: str) -> tuple[str, Timing]:
     recordings = {recording.name: recording for recording in trace}
 
     def timing(sequence: ImageSequence) -> Service:
-        found = recordings.get(sequence.name)
-        if found is None:
+        recording = recordings.get(sequence.name)
+        if recording is None:
             raise LaeError(f"{text}: has no times of sequence {sequence.name!r}")
-        if len(found) != len(sequence):
+        if len(recording) != len(sequence):
             raise LaeError(
-                f"{text}: has {len(found)} frames of sequence {sequence.name!r}, which has "
+                f"{text}: has {len(recording)} frames of sequence {sequence.name!r}, which has "
                 f"{len(sequence)} here"
             )
-        return by_frame(found)
+        return by_frame(recording)
 
     return f"{Path(text).name} ({trace.metadata.device}), not measured here", timing
 

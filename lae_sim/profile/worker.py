@@ -23,6 +23,7 @@ import numpy as np
 from lae_sim.datasets.frames import Image
 from lae_sim.errors import LaeError
 from lae_sim.profile.timed import Answer, TrackerError
+from lae_sim.trackers.protocol import checked_frame
 from lae_sim.trackers.stopwatch import THREAD_VARIABLES, Stopwatch
 
 SERVE = Path(__file__).parents[1] / "trackers" / "serve.py"
@@ -40,17 +41,17 @@ class _Asked(contextlib.AbstractContextManager[Any]):
 
     def init(self, frame: Image, box: Sequence[float]) -> Answer:
         """Start on a new sequence."""
-        return _answer(self._ask("init", frame=_checked(frame), box=_four(box)))
+        return _answer(self._ask("init", frame=checked_frame(frame), box=_four(box)))
 
     def track(self, frame: Image, search: Sequence[float] | None = None) -> Answer:
         """Find the target, around ``cx, cy, w, h`` if ``search`` is given."""
         where = None if search is None else _four(search)
-        return _answer(self._ask("track", frame=_checked(frame), search=where))
+        return _answer(self._ask("track", frame=checked_frame(frame), search=where))
 
     def describe(self) -> Mapping[str, Any]:
         """What the tracker says of itself, and the interpreter and libraries it runs on."""
-        found: Mapping[str, Any] = self._ask("describe")
-        return found
+        description: Mapping[str, Any] = self._ask("describe")
+        return description
 
     def close(self) -> None:
         """End the tracker."""
@@ -101,7 +102,7 @@ class Worker(_Asked):
         self._process: subprocess.Popen[bytes] | None = None
         self._control: Connection
         self._memory: mmap.mmap | bytes = b""
-        self._said = b""
+        self._output = b""
         self._files = contextlib.ExitStack()
         # files without a name: nothing of them can be left behind
         self._log = self._files.enter_context(tempfile.TemporaryFile(buffering=0))  # noqa: SIM115
@@ -127,10 +128,10 @@ class Worker(_Asked):
 
     def _start(self) -> None:
         self._kill()
-        self._control, theirs = Pipe()
+        self._control, workers_end = Pipe()
         limits = {name: str(self._threads) for name in THREAD_VARIABLES if self._threads}
-        with theirs:
-            inherited = theirs.fileno(), self._frames.fileno()
+        with workers_end:
+            inherited = workers_end.fileno(), self._frames.fileno()
             try:
                 self._process = subprocess.Popen(
                     [self._python, str(SERVE), *map(str, inherited)],
@@ -189,7 +190,7 @@ class Worker(_Asked):
     def _received(self, do: str, limit: float) -> bytes:
         """The process's answer; it says why if there is none."""
         assert self._process is not None
-        self._said = b""
+        self._output = b""
         deadline = time.monotonic() + limit
         while not self._control.poll(max(0, min(GLANCE_S, deadline - time.monotonic()))):
             self._pass_on()
@@ -209,10 +210,10 @@ class Worker(_Asked):
         how = f"was ended by {ends.get(code, code)}" if code < 0 else f"exited with status {code}"
         if code == -signal.SIGKILL:
             how += " (out of memory?)"
-        words, _, crash = self._said.decode(errors="replace").partition("Fatal Python error")
+        words, _, crash = self._output.decode(errors="replace").partition("Fatal Python error")
         place = re.search(r"most recent call first\):\n\s*(File .*)", crash)
-        said = words.split("\n")[-2:-1] + ([place[1]] if place else [])
-        return ": ".join([f"the process {how}"] + [line for line in said if line])
+        lines = words.split("\n")[-2:-1] + ([place[1]] if place else [])
+        return ": ".join([f"the process {how}"] + [line for line in lines if line])
 
     def _pass_on(self) -> None:
         """Show what the process printed, and keep the end of it."""
@@ -222,7 +223,7 @@ class Worker(_Asked):
             text = os.pread(log, size, 0)
             os.truncate(log, 0)
             os.lseek(log, 0, os.SEEK_SET)  # the process's own offset too
-            self._said = (self._said + text)[-LAST_WORDS:]
+            self._output = (self._output + text)[-LAST_WORDS:]
             sys.stderr.write(text.decode(errors="replace"))
             sys.stderr.flush()
 
@@ -268,15 +269,9 @@ class InProcess(_Asked):
             raise TrackerError(f"{self._tracker}: {do}: {error}") from error
 
 
-def _answer(found: dict[str, Any]) -> Answer:
-    box = found.pop("box")
-    return Answer(box=None if box is None else tuple(box), **found)
-
-
-def _checked(frame: Image) -> Image:
-    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
-        raise LaeError(f"a frame is uint8 [H, W, 3], not {frame.dtype} {list(frame.shape)}")
-    return frame
+def _answer(fields: dict[str, Any]) -> Answer:
+    box = fields.pop("box")
+    return Answer(box=None if box is None else tuple(box), **fields)
 
 
 def _four(box: Sequence[float]) -> list[float]:

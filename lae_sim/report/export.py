@@ -17,23 +17,21 @@ import numpy as np
 from lae_sim._arrays import Floats
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import Answers
+from lae_sim.evaluation.evaluate import Observer, ScoredRun
 from lae_sim.evaluation.events import event_log
 from lae_sim.files import written_whole
-from lae_sim.replay.run import Run
 from lae_sim.trace.columns import from_numpy
 from lae_sim.trace.recording import BATCH_ROWS
 
-AnswerSink = Callable[[Run, str, Fraction, Answers], None]
-"""``sink(run, forecaster, sigma, answers)`` takes the answers of one sequence."""
-
-RunSink = Callable[[Run], None]
-"""``sink(run)`` takes one replayed sequence."""
-
 
 @contextmanager
-def outputs_file(path: str) -> Iterator[AnswerSink]:
-    """Write every answer: sequence, frame, sigma, forecaster, source_frame, x, y, w, h."""
+def outputs_file(path: str, asked: Sequence[tuple[str, Fraction]]) -> Iterator[Observer]:
+    """Write every answer: sequence, frame, sigma, forecaster, source_frame, x, y, w, h.
+
+    Args:
+        path: the Parquet file.
+        asked: forecasters and permitted latencies, in the order of the rows of a sequence.
+    """
     import pyarrow as pa
 
     schema = pa.schema(
@@ -48,22 +46,24 @@ def outputs_file(path: str) -> Iterator[AnswerSink]:
     )
     with _parquet(path, schema) as write:
 
-        def sink(run: Run, forecaster: str, sigma: Fraction, answers: Answers) -> None:
-            length = len(answers.boxes)
-            write(
-                _repeated(run.recording.name, length),
-                from_numpy(np.arange(length, dtype=np.int32)),
-                from_numpy(np.full(length, float(sigma))),
-                _repeated(forecaster, length),
-                from_numpy(answers.source_frame.astype(np.int32)),
-                *(from_numpy(answers.boxes[:, i]) for i in range(4)),
-            )
+        def observer(scored: ScoredRun) -> None:
+            for forecaster, sigma in asked:
+                answers = scored.answers[forecaster, sigma]
+                length = len(answers.boxes)
+                write(
+                    _repeated(scored.run.recording.name, length),
+                    from_numpy(np.arange(length, dtype=np.int32)),
+                    from_numpy(np.full(length, float(sigma))),
+                    _repeated(forecaster, length),
+                    from_numpy(answers.source_frame.astype(np.int32)),
+                    *(from_numpy(answers.boxes[:, i]) for i in range(4)),
+                )
 
-        yield sink
+        yield observer
 
 
 @contextmanager
-def schedule_file(path: str, clock: Clock) -> Iterator[RunSink]:
+def schedule_file(path: str, clock: Clock) -> Iterator[Observer]:
     """Write every processed frame: sequence, frame, start_ticks, ready_ticks.
 
     The file's metadata holds ``ticks_per_ns`` and ``fps`` as text.
@@ -81,26 +81,27 @@ def schedule_file(path: str, clock: Clock) -> Iterator[RunSink]:
     )
     with _parquet(path, schema) as write:
 
-        def sink(run: Run) -> None:
-            schedule = run.schedule
+        def observer(scored: ScoredRun) -> None:
+            schedule = scored.run.schedule
             write(
-                _repeated(run.recording.name, len(schedule.frames)),
+                _repeated(scored.run.recording.name, len(schedule.frames)),
                 from_numpy(schedule.frames.astype(np.int32)),
                 from_numpy(schedule.start),
                 from_numpy(schedule.ready),
             )
 
-        yield sink
+        yield observer
 
 
 @contextmanager
-def events_file(path: str, sigma: Fraction) -> Iterator[RunSink]:
+def events_file(path: str, sigma: Fraction) -> Iterator[Observer]:
     """Write the event log as JSON lines: sequence, tick, ms, event, frame, source_frame."""
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as lines:
 
-        def sink(run: Run) -> None:
+        def observer(scored: ScoredRun) -> None:
+            run = scored.run
             ticks_per_ms = run.schedule.clock.ticks_per_ns * 10**6
-            for event in event_log(run, sigma):
+            for event in event_log(run, sigma, scored.pairing(sigma)):
                 record = {
                     "sequence": run.recording.name,
                     "tick": event.tick,
@@ -111,11 +112,11 @@ def events_file(path: str, sigma: Fraction) -> Iterator[RunSink]:
                 }
                 lines.write(json.dumps(record) + "\n")
 
-        yield sink
+        yield observer
 
 
 @contextmanager
-def result_folders(folder: str, names: Mapping[tuple[str, Fraction], str]) -> Iterator[AnswerSink]:
+def result_folders(folder: str, names: Mapping[tuple[str, Fraction], str]) -> Iterator[Observer]:
     """Write result text files as the pysot toolkit reads them: ``folder/name/sequence.txt``.
 
     Args:
@@ -141,18 +142,19 @@ def result_folders(folder: str, names: Mapping[tuple[str, Fraction], str]) -> It
         for name in names.values():
             (staging / name).mkdir()
 
-        def sink(run: Run, forecaster: str, sigma: Fraction, answers: Answers) -> None:
-            sequence = run.recording.name
+        def observer(scored: ScoredRun) -> None:
+            sequence = scored.run.recording.name
             if (
                 sequence != os.path.basename(sequence)
                 or "\0" in sequence
                 or sequence in (".", "..")
             ):
                 raise LaeError(f"sequence {sequence!r} cannot be the name of a file")
-            path = staging / names[forecaster, sigma] / f"{sequence}.txt"
-            path.write_text(_text(answers.boxes), encoding="ascii")
+            for asked, name in names.items():
+                path = staging / name / f"{sequence}.txt"
+                path.write_text(_text(scored.answers[asked].boxes), encoding="ascii")
 
-        yield sink
+        yield observer
         for name in names.values():
             os.replace(staging / name, root / name)
     finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Floats
-from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS
-from lae_sim.evaluation.pairing import pair
+from lae_sim.evaluation.pairing import Pairing, pair
+from lae_sim.evaluation.totals import CurveTotals
 from lae_sim.replay.run import Run
 from lae_sim.report.replay import Report
 from lae_sim.report.style import (
@@ -38,27 +38,12 @@ Curves = dict[str, tuple[Floats, Floats]]
 """By name: success over IoU thresholds, and precision over 0..50 px, mean over sequences."""
 
 
-def mean_curves(evaluation: Evaluation, forecasters: Iterable[str]) -> Curves:
-    """Curves of the offline boxes, where the trace holds every frame, and of each forecaster.
-
-    Args:
-        evaluation: whose curves are those of its first permitted latency.
-        forecasters: names of its forecasters.
-    """
-    named = dict(zip(forecasters, zip(evaluation.success, evaluation.precision)))
-    if not evaluation.missing.any():
-        offline = evaluation.offline_success, evaluation.offline_precision
-        named = {"offline": offline, **named}
-    return {
-        name: (_mean(success), _mean(precision)) for name, (success, precision) in named.items()
-    }
-
-
-def _mean(curves: Floats) -> Floats:
-    """Mean of the sequences that the convention counts; NaN if there is none."""
-    kept = curves[~np.isnan(curves).any(axis=1)]
-    mean: Floats = kept.mean(axis=0) if len(kept) else np.full(curves.shape[1], np.nan)
-    return mean
+def mean_curves(totals: CurveTotals, forecasters: Sequence[str]) -> Curves:
+    """Mean curves by name, of sequences that have been scored; offline too where it is known."""
+    means = {name: totals.curves(f) for f, name in enumerate(forecasters)}
+    if totals.complete:
+        means = {"offline": totals.offline, **means}
+    return {name: (mean.success, mean.precision) for name, mean in means.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +228,13 @@ def sweep_figure(
 
 
 @styled
-def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int = 20) -> Figure:
+def timeline(
+    run: Run,
+    sigma: Fraction = Fraction(0),
+    first: int = 0,
+    count: int = 20,
+    pairing: Pairing | None = None,
+) -> Figure:
     """When frames arrived and were processed or skipped, and which output answered each query.
 
     Args:
@@ -251,6 +242,7 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
         sigma: permitted latency of the queries, frames.
         first: first world frame shown.
         count: number of world frames shown.
+        pairing: of the run at that sigma, where it is known already.
     """
     schedule = run.schedule
     clock = schedule.clock
@@ -271,7 +263,8 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
             axes.barh(1, length, left=begin, height=0.42, color=BLUE, edgecolor="white")
             if begin + length / 2 < (end + 0.5) * frame_ms:
                 axes.text(begin + length / 2, 1, str(frame), ha="center", va="center", color="w")
-    _draw_queries(axes, run, sigma, first, end)
+    known = pairing or pair([schedule], [sigma])
+    _draw_queries(axes, run, sigma, known, first, end)
     axes.set_yticks(
         [2, 1, 0], ["world frame\n(hollow: skipped)", "tracker busy", "query and source"]
     )
@@ -280,11 +273,12 @@ def timeline(run: Run, sigma: Fraction = Fraction(0), first: int = 0, count: int
     return figure
 
 
-def _draw_queries(axes: Axes, run: Run, sigma: Fraction, first: int, end: int) -> None:
+def _draw_queries(
+    axes: Axes, run: Run, sigma: Fraction, pairing: Pairing, first: int, end: int
+) -> None:
     """A mark for each query, joined to the moment when the output that answers it was ready."""
     schedule = run.schedule
     clock = schedule.clock
-    pairing = pair([schedule], [sigma])
     spans = zip(schedule.frames, schedule.ready, pairing.first[:, 0], pairing.end[:, 0])
     for source, ready, begin, stop in spans:
         for frame in range(max(begin, first), min(stop, end)):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import ChainMap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from operator import itemgetter
@@ -12,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim._arrays import Floats
 from lae_sim.comparison.statistics import recovered
 from lae_sim.engine.clock import Clock
-from lae_sim.evaluation.evaluate import Evaluation
+from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
+from lae_sim.evaluation.totals import RECOVERED, ScoreTotals, Totals
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.table import (
     CHANGE,
@@ -33,81 +34,76 @@ Report = dict[str, Any]
 
 
 def trace_report(
-    evaluation: Evaluation,
+    totals: Totals,
     clock: Clock,
     forecasters: Sequence[str],
     sigmas: Sequence[Fraction],
     convention: str,
-    attributes: Mapping[str, list[int]] | None = None,
-    per_sequence: bool = False,
+    per_sequence: SequenceRows | None = None,
+    attributes: bool = True,
 ) -> Report:
     """The figures of one trace as a JSON object (documented in the README).
 
     Args:
-        evaluation: scores, whose forecasters and sigmas are the ones named.
+        totals: scores, whose forecasters and sigmas are the ones named.
         clock: the world's clock.
         forecasters: names; ``"hold"`` must be among them.
         sigmas: permitted latencies in frames, ascending.
         convention: the convention's name.
-        attributes: for each attribute the indices of the sequences that have it, to report apart.
-        per_sequence: whether to report each sequence.
+        per_sequence: each sequence, if they are to be reported too.
+        attributes: whether to report those attributes that the totals know.
     """
-    frames, processed = int(evaluation.frames.sum()), int(evaluation.processed.sum())
-    calls = processed - len(evaluation.sequences)
-    calls_ns = int(evaluation.calls_ns.sum())
-    departures = int(evaluation.departures.sum())
+    replay, staleness = totals.replay, totals.staleness
+    frames, processed = int(replay.frames.sum()), int(replay.processed.sum())
+    calls = processed - len(replay.sequences)
+    calls_ns = int(replay.calls_ns.sum())
+    departures = int(replay.departures.sum())
     zero = sigmas.index(Fraction(0)) if 0 in sigmas else 0
-    offline = {metric: _offline(evaluation, metric, slice(None)) for metric in METRICS}
-    grid = set(SIGMA_GRID) <= set(sigmas)
+    offline = {metric: _number(totals.scores.offline(metric)) for metric in METRICS}
+    over_all = _scores(totals.scores, forecasters)
+    by_attribute = {
+        name: (scores.sequences, _scores(scores, forecasters))
+        for name, scores in sorted(totals.by_attribute.items() if attributes else ())
+    }
     results = []
     for f, forecaster in enumerate(forecasters):
         means = {}
-        if grid:
-            means["mauc"] = _grid_mean(evaluation, "auc", f, sigmas)
-            means["mdp"] = _grid_mean(evaluation, "dp20", f, sigmas)
+        if set(SIGMA_GRID) <= set(sigmas):
+            means["mauc"] = _grid_mean([scores["auc"] for scores in over_all[f]], sigmas)
+            means["mdp"] = _grid_mean([scores["dp20"] for scores in over_all[f]], sigmas)
         for s, sigma in enumerate(sigmas):
+            total = int(staleness.mismatch_sum[s])
             result = {
                 "forecaster": forecaster,
                 "sigma": float(sigma),
                 "convention": convention,
-                **_scores(evaluation, forecasters, f, s, slice(None)),
+                **over_all[f][s],
                 **means,
-                **_staleness(evaluation, s, sigma, clock),
+                "mismatch_sum": total,
+                "mismatch_mean": total / frames,
+                "mismatch_max": int(staleness.mismatch_max[s]),
+                # the query is sigma frames after the frame it is for
+                "age_ms": clock.milliseconds(Fraction(total, frames) + sigma),
+                "longest_stale_ms": clock.milliseconds(int(staleness.longest_hold[s])),
             }
-            if attributes:
+            if by_attribute:
                 result["attributes"] = {
-                    name: {
-                        "sequences": len(members),
-                        **_scores(evaluation, forecasters, f, s, members),
-                    }
-                    for name, members in attributes.items()
+                    name: {"sequences": count, **scores[f][s]}
+                    for name, (count, scores) in by_attribute.items()
                 }
-            if per_sequence:
-                result["per_sequence"] = [
-                    {
-                        "sequence": name,
-                        "world_frames": int(evaluation.frames[i]),
-                        "processed": int(evaluation.processed[i]),
-                        "mismatch_sum": int(evaluation.mismatch_sum[i, s]),
-                        "approximate_outputs": int(evaluation.departures[i]),
-                        "disagreement": _number(evaluation.disagreement[i]),
-                        "offline_auc": _number(evaluation.offline["auc"][i]),
-                        "offline_dp20": _number(evaluation.offline["dp20"][i]),
-                        **_scores(evaluation, forecasters, f, s, slice(i, i + 1)),
-                    }
-                    for i, name in enumerate(evaluation.sequences)
-                ]
+            if per_sequence is not None:
+                result["per_sequence"] = per_sequence.of(f, s)
             results.append(result)
     return {
-        "sequences": len(evaluation.sequences),
+        "sequences": len(replay.sequences),
         "world_frames": frames,
-        "frames_without_truth": int(evaluation.truthless.sum()),
+        "frames_without_truth": int(replay.truthless.sum()),
         "processed": processed,
         "skip_rate": 1 - processed / frames,
-        "mismatch_sum": int(evaluation.mismatch_sum[:, zero].sum()),
+        "mismatch_sum": int(staleness.mismatch_sum[zero]),
         "tracker_fps": calls / calls_ns * 1e9 if calls_ns else None,
-        "tracker_fps_mean": _number(float(evaluation.calls_hz.sum()) / calls) if calls else None,
-        "init_ms": float(np.mean(evaluation.init_ns)) / 1e6,
+        "tracker_fps_mean": _number(float(replay.calls_hz.sum()) / calls) if calls else None,
+        "init_ms": float(np.mean(replay.init_ns)) / 1e6,
         "exact": departures == 0,
         "approximate_outputs": departures,
         "approximate_share": departures / calls if calls else 0.0,
@@ -116,76 +112,98 @@ def trace_report(
     }
 
 
-def _scores(
-    evaluation: Evaluation, forecasters: Sequence[str], f: int, s: int, which: slice | list[int]
-) -> Report:
-    """Mean scores over some sequences, with the share of the latency loss recovered."""
-    means: Report = {m: _mean(evaluation.scores[m][f, which, s]) for m in METRICS}
-    hold = forecasters.index("hold")
-    for metric in ("auc", "dp20"):
-        share = None
-        if f != hold and not evaluation.missing[which].any():
-            scores = evaluation.scores[metric]
-            share = _recovered(
-                evaluation.offline[metric][which], scores[hold, which, s], scores[f, which, s]
-            )
-        means[f"recovered_{metric}"] = share
-    return means
+def _scores(totals: ScoreTotals, forecasters: Sequence[str]) -> list[list[Report]]:
+    """Mean scores, with the share of the latency loss recovered, by forecaster and sigma."""
+    means = {metric: totals.mean(metric).tolist() for metric in METRICS}
+    won = {metric: totals.won(metric).tolist() for metric in RECOVERED}
+    lost = {metric: totals.lost(metric).tolist() for metric in RECOVERED}
+
+    def one(f: int, s: int) -> Report:
+        scores = {metric: _number(means[metric][f][s]) for metric in METRICS}
+        comparable = totals.complete and forecasters[f] != "hold"
+        for metric in RECOVERED:
+            share = recovered(won[metric][f][s], lost[metric][f][s]) if comparable else None
+            scores[f"recovered_{metric}"] = share
+        return scores
+
+    count = len(means[METRICS[0]][0])
+    return [[one(f, s) for s in range(count)] for f in range(len(forecasters))]
 
 
-def _recovered(offline: Floats, hold: Floats, forecast: Floats) -> float | None:
-    """Share of the latency loss recovered, over sequences that count in all; none if no loss."""
-    counted = ~np.isnan(offline + hold + forecast)
-    won, lost = (float((scores - hold)[counted].sum()) for scores in (forecast, offline))
-    return recovered(won, lost)
-
-
-def _offline(evaluation: Evaluation, metric: str, which: slice | list[int]) -> float | None:
-    """Mean offline score over some sequences; none unless the trace has every frame of all."""
-    if evaluation.missing[which].any():
-        return None
-    return _mean(evaluation.offline[metric][which])
-
-
-def _staleness(evaluation: Evaluation, s: int, sigma: Fraction, clock: Clock) -> Report:
-    """How old the answers are: the query is sigma frames after the frame it is for."""
-    total, frames = int(evaluation.mismatch_sum[:, s].sum()), int(evaluation.frames.sum())
-    return {
-        "mismatch_sum": total,
-        "mismatch_mean": total / frames,
-        "mismatch_max": int(evaluation.mismatch_max[:, s].max()),
-        "age_ms": clock.milliseconds(Fraction(total, frames) + sigma),
-        "longest_stale_ms": clock.milliseconds(int(evaluation.longest_hold[:, s].max())),
-    }
-
-
-def _grid_mean(
-    evaluation: Evaluation, metric: str, f: int, sigmas: Sequence[Fraction]
-) -> float | None:
+def _grid_mean(scores: Sequence[float | None], sigmas: Sequence[Fraction]) -> float | None:
     """Plain mean over the 51 permitted latencies of PVT++ (2023)."""
-    on_grid = [s for s, sigma in enumerate(sigmas) if sigma in SIGMA_GRID]
-    means = [_mean(evaluation.scores[metric][f, :, s]) for s in on_grid]
-    known = [mean for mean in means if mean is not None]
+    on_grid = [score for score, sigma in zip(scores, sigmas) if sigma in SIGMA_GRID]
+    known = [score for score in on_grid if score is not None]
     return math.fsum(known) / len(known) if len(known) == len(on_grid) else None
-
-
-def _mean(values: Any) -> float | None:
-    """Mean of the sequences that have a value."""
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else None
 
 
 def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+class SequenceRows:
+    """What is reported of each sequence, for every forecaster and sigma.
+
+    Attributes:
+        parts: the scores of all sequences, in groups, without their curves.
+    """
+
+    def __init__(self, forecasters: Sequence[str]) -> None:
+        self._hold = forecasters.index("hold")
+        self.parts: list[Evaluation] = []
+
+    def add(self, part: Evaluation) -> None:
+        """Take in a group of sequences; its curves are not kept."""
+        none = Curves(np.empty(0), np.empty(0))
+        self.parts.append(replace(part, curves=none, offline_curves=none))
+
+    def of(self, f: int, s: int) -> list[Report]:
+        """Those of one forecaster and sigma, by their indices."""
+        return [row for part in self.parts for row in self._rows(part, f, s)]
+
+    def _rows(self, part: Evaluation, f: int, s: int) -> Iterator[Report]:
+        replay = part.replay
+        scores = {metric: part.scores[metric][f, :, s].tolist() for metric in METRICS}
+        hold = {metric: part.scores[metric][self._hold, :, s].tolist() for metric in RECOVERED}
+        offline = {metric: part.offline[metric].tolist() for metric in RECOVERED}
+        columns = zip(
+            replay.sequences,
+            replay.frames.tolist(),
+            replay.processed.tolist(),
+            part.staleness.mismatch_sum[:, s].tolist(),
+            replay.departures.tolist(),
+            replay.disagreement.tolist(),
+        )
+        for i, (name, frames, processed, mismatch, departures, disagreement) in enumerate(columns):
+            shares = {}
+            for metric in RECOVERED:
+                won = scores[metric][i] - hold[metric][i]
+                lost = offline[metric][i] - hold[metric][i]
+                share = None
+                if f != self._hold and math.isfinite(won + lost):
+                    share = recovered(won, lost)
+                shares[f"recovered_{metric}"] = share
+            yield {
+                "sequence": name,
+                "world_frames": frames,
+                "processed": processed,
+                "mismatch_sum": mismatch,
+                "approximate_outputs": departures,
+                "disagreement": _number(disagreement),
+                "offline_auc": _number(offline["auc"][i]),
+                "offline_dp20": _number(offline["dp20"][i]),
+                **{metric: _number(scores[metric][i]) for metric in METRICS},
+                **shares,
+            }
+
+
 def attribute_members(metadata: Metadata, sequences: Iterable[str]) -> dict[str, list[int]]:
-    """Indices of the sequences that have each attribute, attributes in order of their names."""
+    """Indices of the sequences that have each attribute."""
     members: dict[str, list[int]] = {}
     for i, sequence in enumerate(sequences):
         for attribute in metadata.attributes(sequence):
             members.setdefault(attribute, []).append(i)
-    return dict(sorted(members.items()))
+    return members
 
 
 SWEPT = {"fps": "fps", "latency_scale": "scale"}

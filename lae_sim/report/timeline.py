@@ -20,20 +20,24 @@ from fractions import Fraction
 from itertools import count, islice
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.pairing import pair
+from lae_sim.evaluation.evaluate import Observer, ScoredRun
+from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.files import written_whole
 from lae_sim.replay.run import Run
-from lae_sim.report.export import RunSink, sigma_text
+from lae_sim.report.export import sigma_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TraceEvent = dict[str, Any]
 """One object of the Trace Event Format."""
 
 
 @contextmanager
-def timeline_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Iterator[RunSink]:
+def timeline_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Iterator[Observer]:
     """Write a timeline: of all sequences as Trace Events (.json), of the first one as a picture.
 
     Args:
@@ -46,8 +50,8 @@ def timeline_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Itera
     """
     ending = Path(path).suffix.lower()
     if ending == ".json":
-        with _events_file(path, sigma, costs) as sink:
-            yield sink
+        with _events_file(path, sigma, costs) as observer:
+            yield observer
         return
     if ending not in (".png", ".svg", ".pdf"):
         raise LaeError(
@@ -59,32 +63,42 @@ def timeline_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Itera
     from lae_sim.report.figures import timeline
     from lae_sim.report.style import save
 
-    first: list[Run] = []
-    yield lambda run: first.extend([] if first else [run])
-    save(timeline(first[0], sigma), path)
+    pictures: list[Figure] = []
+
+    def draw_first(scored: ScoredRun) -> None:
+        if not pictures:
+            pictures.append(timeline(scored.run, sigma, pairing=scored.pairing(sigma)))
+
+    yield draw_first
+    save(pictures[0], path)
 
 
 @contextmanager
-def _events_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Iterator[RunSink]:
+def _events_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Iterator[Observer]:
     """Write the events of each sequence as it comes, some thousands a line."""
     head = {"displayTimeUnit": "ms", "otherData": {"sigma": sigma_text(sigma)}}
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(json.dumps(head)[:-1] + ', "traceEvents": [')
         processes, separator = count(1), "\n"
 
-        def sink(run: Run) -> None:
+        def observer(scored: ScoredRun) -> None:
             nonlocal separator
-            events = trace_events(run, sigma, costs, next(processes))
+            pairings = {cost: scored.pairing(sigma, cost) for cost in {0, *costs.values()}}
+            events = trace_events(scored.run, sigma, costs, next(processes), pairings)
             while some := list(islice(events, 4096)):
                 file.write(separator + json.dumps(some, separators=(",", ":"))[1:-1])
                 separator = ",\n"
 
-        yield sink
+        yield observer
         file.write("\n]}\n")
 
 
 def trace_events(
-    run: Run, sigma: Fraction, costs: Mapping[str, int], process: int = 1
+    run: Run,
+    sigma: Fraction,
+    costs: Mapping[str, int],
+    process: int = 1,
+    pairings: Mapping[int, Pairing] | None = None,
 ) -> Iterator[TraceEvent]:
     """The Trace Events of one sequence.
 
@@ -94,8 +108,12 @@ def trace_events(
         costs: what an answer of each forecaster costs, ns. Forecasters whose answers cost the same
             share a track of queries.
         process: the number of the sequence in the trace, from 1.
+        pairings: of the run at that sigma, at no cost and at each of the costs, where they are
+            known already.
     """
     schedule = run.schedule
+    if pairings is None:
+        pairings = {cost: pair([schedule], [sigma], cost) for cost in {0, *costs.values()}}
     interval, ticks_per_ns = schedule.clock.frame_ticks, schedule.clock.ticks_per_ns
     early = max(ceil(-sigma), 0) * interval
     # a thread of its process's number would be its main thread, which Perfetto shows first; flows
@@ -136,9 +154,9 @@ def trace_events(
         its = {"frame": frame, "start_ticks": begin, "ready_ticks": end}
         yield span(tracker, f"frame {frame}", begin, end, **its)
 
-    free = pair([schedule], [sigma]).first[:, 0]
+    free = pairings[0].first[:, 0]
     for cost_ns in dict.fromkeys(costs.values()):
-        pairing = pair([schedule], [sigma], cost_ns=cost_ns)
+        pairing = pairings[cost_ns]
         first, end_frame = pairing.first[:, 0], pairing.end[:, 0]
         used = (end_frame > first).nonzero()[0].tolist()
         spans = [(k, int(pairing.frames[k]), int(first[k]), int(end_frame[k])) for k in used]

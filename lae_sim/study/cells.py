@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from typing import Any
@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from lae_sim import __version__
-from lae_sim._arrays import Ints
 from lae_sim.engine.lanes import batchable
 from lae_sim.evaluation.caveats import notes_on
-from lae_sim.evaluation.evaluate import Evaluation, evaluate_groups
-from lae_sim.evaluation.metrics import METRICS, find_convention
+from lae_sim.evaluation.evaluate import ReplayStatistics, evaluate_groups
+from lae_sim.evaluation.metrics import find_convention
+from lae_sim.evaluation.totals import CurveTotals
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes
 from lae_sim.replay.latency import RandomSource
@@ -217,27 +217,27 @@ def compute(task: Task) -> list[Result]:
             repetitions.append(repetition)
             yield run
 
-    curves, kept = _Curves(), []
+    curves, kept = CurveTotals(), []
     departures = calls = 0
     for part in evaluate_groups(
         runs(), trace.metadata, chosen, world.sigmas, convention, costs=costs, frames=GROUP
     ):
-        of_part = np.array(repetitions[: len(part.sequences)], np.int32)
-        del repetitions[: len(part.sequences)]
+        of_part = np.array(repetitions[: len(part.replay.sequences)], np.int32)
+        del repetitions[: len(part.replay.sequences)]
         for f, writer in enumerate(writers):
             writer.add(part, f, of_part)
         curves.add(part)
-        departures += int(part.departures.sum())
-        calls += int((part.processed - 1).sum())
-        kept.append(_without_scores(part, np.flatnonzero(of_part == setting.first)))
-    about = Evaluation.joined(kept)
+        departures += int(part.replay.departures.sum())
+        calls += int((part.replay.processed - 1).sum())
+        kept.append(part.replay.chosen(np.flatnonzero(of_part == setting.first)))
+    about = ReplayStatistics.joined(kept)
     results = []
     for f, (cell, writer) in enumerate(zip(cells, writers)):
         only = {cell.forecaster: chosen[cell.forecaster]}
         details = {
             "engine": replay.engine,
             "repetitions": setting.count,
-            "curves": curves.means(f),
+            "curves": _curves(curves, f),
             "approximate_outputs": departures,
             "calls": calls,
             "notes": [
@@ -249,55 +249,16 @@ def compute(task: Task) -> list[Result]:
     return results
 
 
-def _without_scores(part: Evaluation, kept: Ints) -> Evaluation:
-    """Some sequences of a part without their scores: what notes are about."""
-    none = np.zeros((1, len(kept), 0))
-    scored = ("scores", "failure", "success", "precision")
-    offline = ("offline", "offline_success", "offline_precision")
-    columns: dict[str, Any] = {
-        field.name: getattr(part, field.name)[kept]
-        for field in fields(part)
-        if field.name not in ("sequences", *scored, *offline)
+def _curves(totals: CurveTotals, f: int) -> dict[str, list[float] | None]:
+    """Those of a forecaster, and offline; None where no sequence counts."""
+    forecast, offline = totals.curves(f), totals.offline
+    named = {
+        "success": forecast.success,
+        "offline_success": offline.success,
+        "precision": forecast.precision,
+        "offline_precision": offline.precision,
     }
-    return Evaluation(
-        sequences=tuple(part.sequences[s] for s in kept),
-        scores=dict.fromkeys(METRICS, none),
-        failure=none.astype(np.int64),
-        success=none,
-        precision=none,
-        offline={metric: values[kept] for metric, values in part.offline.items()},
-        offline_success=none[0],
-        offline_precision=none[0],
-        **columns,
-    )
-
-
-class _Curves:
-    """Mean success and precision curves over sequences and repetitions, at the first sigma."""
-
-    def __init__(self) -> None:
-        self._sums: dict[str, Any] = {}
-        self._counts: dict[str, Any] = {}
-
-    def add(self, part: Evaluation) -> None:
-        offline = part.offline_success[None], part.offline_precision[None]
-        named = {
-            "success": np.concatenate([part.success, offline[0]]),
-            "precision": np.concatenate([part.precision, offline[1]]),
-        }
-        for name, curves in named.items():
-            self._sums[name] = self._sums.get(name, 0) + np.nansum(curves, axis=1)
-            known = (~np.isnan(curves[:, :, 0])).sum(axis=1)
-            self._counts[name] = self._counts.get(name, 0) + known
-
-    def means(self, f: int) -> dict[str, list[float] | None]:
-        """Those of a forecaster, and offline."""
-        found: dict[str, list[float] | None] = {}
-        for name, sums in self._sums.items():
-            for label, which in ((name, f), (f"offline_{name}", -1)):
-                count = int(self._counts[name][which])
-                found[label] = (sums[which] / count).tolist() if count else None
-        return found
+    return {name: None if np.isnan(c[0]) else c.tolist() for name, c in named.items()}
 
 
 @dataclass(frozen=True)

@@ -71,28 +71,29 @@ class CellRows:
         import pyarrow as pa
 
         count = len(self._sigmas)
-        calls = np.where(part.processed > 1, part.processed - 1, np.nan)
+        replay, staleness = part.replay, part.staleness
+        calls = np.where(replay.processed > 1, replay.processed - 1, np.nan)
         once: dict[str, npt.NDArray[Any]] = {  # by sequence
             "repetition": repetitions,
-            "world_frames": part.frames,
-            "processed": part.processed,
-            "approximate_outputs": part.departures,
-            "elapsed_ms": part.calls_ns / calls / 1e6,
+            "world_frames": replay.frames,
+            "processed": replay.processed,
+            "approximate_outputs": replay.departures,
+            "elapsed_ms": replay.calls_ns / calls / 1e6,
             **{f"offline_{metric}": part.offline[metric] for metric in METRICS},
         }
         values = {name: np.repeat(column, count) for name, column in once.items()}
         values |= {  # by sequence and sigma
-            "mismatch_mean": (part.mismatch_sum / part.frames[:, None]).ravel(),
-            "mismatch_max": part.mismatch_max.ravel(),
-            "longest_hold": part.longest_hold.ravel(),
+            "mismatch_mean": (staleness.mismatch_sum / replay.frames[:, None]).ravel(),
+            "mismatch_max": staleness.mismatch_max.ravel(),
+            "longest_hold": staleness.longest_hold.ravel(),
             "failure_frame": part.failure[f].ravel(),
             **{metric: part.scores[metric][f].ravel() for metric in METRICS},
         }
-        values["sigma"] = np.tile(self._sigmas, len(part.sequences))
+        values["sigma"] = np.tile(self._sigmas, len(replay.sequences))
         rows = len(values["sigma"])
         columns = {
             **{name: from_texts([text], rows) for name, text in self._about.items()},
-            "sequence": from_texts(part.sequences, count),
+            "sequence": from_texts(replay.sequences, count),
             **{name: from_numpy(column.astype(COLUMNS[name])) for name, column in values.items()},
         }
         arrays = [columns[name] for name in COLUMNS]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import importlib.util
 import sys
@@ -30,10 +29,10 @@ def existing(path: str | Path, what: str, folder: bool = False) -> Path:
     Raises:
         LaeError: if it is not.
     """
-    found = Path(path).expanduser().resolve()
-    if not (found.is_dir() if folder else found.is_file()):
-        raise LaeError(f"{found}: no such {'folder' if folder else 'file'} ({what})")
-    return found
+    absolute = Path(path).expanduser().resolve()
+    if not (absolute.is_dir() if folder else absolute.is_file()):
+        raise LaeError(f"{absolute}: no such {'folder' if folder else 'file'} ({what})")
+    return absolute
 
 
 def torch_on(device: str) -> Any:
@@ -150,15 +149,6 @@ def stand_ins(names: Sequence[str]) -> Iterator[list[str]]:
         yield absent
     finally:
         sys.meta_path.remove(finder)
-
-
-def sha256(path: Path) -> str:
-    """The SHA-256 of a file, in hexadecimal digits."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        for block in iter(lambda: file.read(1 << 20), b""):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def commit(checkout: Path) -> str | None:

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from lae_sim.errors import LaeError
-from lae_sim.trackers.protocol import Array, Image, checked_box, checked_frame
+from lae_sim.trackers.protocol import Array, Image, checked_box, checked_frame, checked_search
 
 CELLS = 32  # of the search window, whose side is CELL * CELLS pixels whatever the target's size
 SCALE_SIDE = 32  # pixels of a patch of the scale filter
@@ -110,10 +110,7 @@ class Dcf:
         Raises:
             LaeError: if a number is not finite.
         """
-        if not np.isfinite([cx, cy, w, h]).all():
-            raise LaeError(f"cannot search around {cx, cy} for a target of {w, h} pixels")
-        self._centre = np.array([cx, cy], float)
-        self._size = np.maximum([w, h], 1.0)
+        self._centre, self._size = checked_search(cx, cy, w, h)
 
     def track(self, frame: Image) -> tuple[tuple[float, float, float, float], float]:
         """The target's box in the next frame, and the peak-to-sidelobe ratio.
@@ -159,9 +156,9 @@ class Dcf:
     def _channels(self, frame: Image) -> Any:
         """Fourier transform of the search window's channels, complex64 [C, CELLS, CELLS/2 + 1]."""
         side = self._side()
-        found = features(crop(frame, self._centre, (side, side), CELLS * CELL))
-        found -= found.mean((1, 2), keepdims=True)
-        return self._fft.rfft2(self._to(found * self._window))
+        channels = features(crop(frame, self._centre, (side, side), CELLS * CELL))
+        channels -= channels.mean((1, 2), keepdims=True)
+        return self._fft.rfft2(self._to(channels * self._window))
 
     def _learn(self, frame: Image) -> None:
         """Bring the filter up to date.

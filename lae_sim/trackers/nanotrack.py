@@ -9,7 +9,6 @@ Li et al., SiamRPN++, CVPR 2019.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,14 @@ import cv2
 import numpy as np
 
 from lae_sim.errors import LaeError
-from lae_sim.trackers.protocol import Array, Image, checked_box, checked_frame
+from lae_sim.trackers.protocol import (
+    Array,
+    Image,
+    checked_box,
+    checked_frame,
+    checked_search,
+    weights_digest,
+)
 
 TEMPLATE, SEARCH, STRIDE = 127, 255, 16  # pixels of the two inputs, and of a step of the output
 CONTEXT = 0.5
@@ -49,7 +55,7 @@ class NanoTrack:
         paths = [_find(weights, "backbone", backbone), _find(weights, "head", head)]
         self._backbone, self._head = (_network(path, device) for path in paths)
         self._device = device
-        self._digest = hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
+        self._digest = weights_digest(*paths)
         try:
             self._template = self._features(np.zeros((TEMPLATE, TEMPLATE, 3), np.uint8)).copy()
             scores, _ = self._correlate(np.zeros((SEARCH, SEARCH, 3), np.uint8))
@@ -85,9 +91,7 @@ class NanoTrack:
         Raises:
             LaeError: if a number is not finite.
         """
-        if not np.isfinite([cx, cy, w, h]).all():
-            raise LaeError(f"cannot search around {cx, cy} for a target of {w, h} pixels")
-        self._centre, self._size = np.array([cx, cy], float), np.maximum([w, h], 1.0)
+        self._centre, self._size = checked_search(cx, cy, w, h)
 
     def track(self, frame: Image) -> tuple[tuple[float, float, float, float], float]:
         """The target's box in the next frame, and its probability as the network sees it.
@@ -120,9 +124,9 @@ class NanoTrack:
             ]
         )
         rate = penalty[best] * scores[best] * self._rate
-        found = np.array([width[best], height[best]]) / zoom
+        target_size = np.array([width[best], height[best]]) / zoom
         self._centre = np.clip(self._centre + offset / zoom, 0, edge)
-        size = (1 - rate) * self._size + rate * found
+        size = (1 - rate) * self._size + rate * target_size
         self._size = np.clip(size, SMALLEST, np.maximum(edge, SMALLEST))
         (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
         return (cx - w / 2, cy - h / 2, w, h), float(scores[best])
@@ -179,18 +183,18 @@ def _overall(w: Any, h: Any) -> Any:
 def _find(folder: str, part: str, given: str) -> Path:
     """The file of one of the two networks."""
     if given:
-        found = [Path(given)] if Path(given).is_file() else []
+        files = [Path(given)] if Path(given).is_file() else []
         sought = given
     else:
         sought = f"{Path(folder) / f'*{part}*.onnx'}" if folder else f"{part}=FILE"
-        found = sorted(Path(folder).glob(f"*{part}*.onnx")) if folder else []
-    if len(found) != 1:
-        problem = "more than one" if found else "no"
+        files = sorted(Path(folder).glob(f"*{part}*.onnx")) if folder else []
+    if len(files) != 1:
+        problem = "more than one" if files else "no"
         raise LaeError(
             f"nanotrack: {problem} file {sought}; give weights=FOLDER, or backbone=FILE and "
             f"head=FILE (two ONNX files; {_UPSTREAM})"
         )
-    return found[0]
+    return files[0]
 
 
 def _network(path: Path, device: str) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import cv2
 
 from lae_sim.errors import LaeError
-from lae_sim.trackers.protocol import Image, checked_box, checked_frame
+from lae_sim.trackers.protocol import Image, checked_box, checked_frame, weights_digest
 
 _MAIN = {"mil": "MIL", "nano": "Nano", "vit": "Vit", "dasiamrpn": "DaSiamRPN", "goturn": "GOTURN"}
 _CONTRIB = {"csrt": "CSRT", "kcf": "KCF"}
@@ -70,9 +69,7 @@ class OpenCv:
             "prototxt": prototxt,
         }
         self._files = _checked_files(name, {k: str(v) for k, v in given.items() if v})
-        self._digest = hashlib.sha256()
-        for path in self._files.values():
-            self._digest.update(Path(path).read_bytes())
+        self._digest = weights_digest(*self._files.values())
         self._networks: list[Any] | None = []
         try:
             self._networks = self._loaded()
@@ -129,12 +126,16 @@ class OpenCv:
 
     def describe(self) -> dict[str, Any]:
         """Name, version, settings and digest of the weights, SHA-256 of the files."""
-        told: dict[str, Any] = {"name": f"opencv:{self._name}", "version": cv2.__version__}
-        told["settings"] = {"seed": self._seed}
+        settings = {"seed": self._seed}
+        description = {
+            "name": f"opencv:{self._name}",
+            "version": cv2.__version__,
+            "settings": settings,
+        }
         if self._files:
-            told["settings"]["network_loaded_in_init"] = self._networks is None
-            told["weights_digest"] = self._digest.hexdigest()
-        return told
+            settings["network_loaded_in_init"] = self._networks is None
+            description["weights_digest"] = self._digest
+        return description
 
     def _loaded(self) -> list[Any] | None:
         """The networks, or None where this version of OpenCV only takes the names of files."""
@@ -158,19 +159,19 @@ class OpenCv:
 
 def _factory(name: str) -> Any:
     """What makes an OpenCV tracker of that name."""
-    found = {}
+    available = {}
     for known, module in ((_MAIN, cv2), (_CONTRIB, cv2), (_LEGACY, getattr(cv2, "legacy", None))):
         for key, title in known.items():
             create = getattr(module, f"Tracker{title}_create", None)
             if create:
-                found[key] = create
-    if name in found:
-        return found[name]
+                available[key] = create
+    if name in available:
+        return available[name]
     where = ""
     if name in _CONTRIB or name in _LEGACY:
         where = "; it is in the package opencv-contrib-python-headless, to be installed instead"
-    there = ", ".join(found)
-    raise LaeError(f"OpenCV {cv2.__version__} here has no tracker {name!r}, only {there}{where}")
+    names = ", ".join(available)
+    raise LaeError(f"OpenCV {cv2.__version__} here has no tracker {name!r}, only {names}{where}")
 
 
 def _checked_files(name: str, given: dict[str, str]) -> dict[str, str]:
@@ -181,9 +182,9 @@ def _checked_files(name: str, given: dict[str, str]) -> dict[str, str]:
         raise LaeError(f"opencv:{name} takes no {', '.join(extra)}")
     lacking = [option for option in wanted if not Path(given.get(option, "")).is_file()]
     if lacking:
-        told = ", ".join(f"{o}={given.get(o, 'FILE')}" for o in lacking)
+        missing = ", ".join(f"{o}={given.get(o, 'FILE')}" for o in lacking)
         raise LaeError(
-            f"opencv:{name} needs the files of its network; there is no {told} "
+            f"opencv:{name} needs the files of its network; there is no {missing} "
             f"(OpenCV's documentation of Tracker{_MAIN[name]} says where to get them)"
         )
     return {option: given[option] for option in wanted}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 from typing import TYPE_CHECKING, Any, Optional, Protocol, Sequence, Tuple, Union
 
 from lae_sim.errors import LaeError
@@ -71,3 +73,26 @@ def checked_box(box: Sequence[float]) -> tuple[float, float, float, float]:
     if not np.isfinite(numbers).all() or w < 0 or h < 0:
         raise LaeError(f"not a box x, y, w, h that a tracker can use: {numbers}")
     return x, y, max(w, 1.0), max(h, 1.0)
+
+
+def checked_search(cx: float, cy: float, w: float, h: float) -> tuple[Array, Array]:
+    """Centre and size of a search as float64 [2] each, no thinner than a pixel.
+
+    Raises:
+        LaeError: if a number is not finite.
+    """
+    import numpy as np
+
+    if not np.isfinite([cx, cy, w, h]).all():
+        raise LaeError(f"cannot search around {cx, cy} for a target of {w, h} pixels")
+    return np.array([cx, cy], float), np.maximum([w, h], 1.0)
+
+
+def weights_digest(*paths: str | os.PathLike[str]) -> str:
+    """The SHA-256 of files one after the other, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with open(path, "rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()

@@ -24,11 +24,10 @@ from lae_sim.trackers.checkout import (
     explained,
     import_from,
     replaced,
-    sha256,
     stand_ins,
     torch_on,
 )
-from lae_sim.trackers.protocol import Box, Image, Output
+from lae_sim.trackers.protocol import Box, Image, Output, weights_digest
 
 # what forks import for training, drawing and logs
 _UNUSED = ("colorama", "matplotlib", "pycocotools", "tensorboardX", "tqdm", "visdom")
@@ -103,9 +102,9 @@ class PySot:
     def track(self, frame: Image) -> Output:
         """Find the target in the next frame."""
         with replaced(*self._no_cuda):
-            found = self._tracker.track(frame)
-        box = [float(value) for value in found["bbox"]]
-        return (box, float(found["best_score"])) if "best_score" in found else box
+            output = self._tracker.track(frame)
+        box = [float(value) for value in output["bbox"]]
+        return (box, float(output["best_score"])) if "best_score" in output else box
 
     def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
         """Search around this centre, at this scale, next."""
@@ -120,10 +119,10 @@ class PySot:
     def describe(self) -> dict[str, Any]:
         """Name (the folder of the configuration), commit of the checkout, settings, weights."""
         kind = type(self._tracker).__name__
-        named = self._config.parent.name
+        folder = self._config.parent.name
         backbone = getattr(getattr(self._cfg, "BACKBONE", None), "TYPE", None)
         return {
-            "name": kind if named in ("experiments", self._checkout.name) else named,
+            "name": kind if folder in ("experiments", self._checkout.name) else folder,
             "version": commit(self._checkout),
             "settings": {
                 "toolkit": "pysot",
@@ -131,7 +130,7 @@ class PySot:
                 "backbone": backbone,
                 "device": self._device,
             },
-            "weights_digest": sha256(self._snapshot),
+            "weights_digest": weights_digest(self._snapshot),
             "libraries": {"cuda": self._torch.version.cuda},
         }
 
@@ -167,11 +166,11 @@ class PySot:
             "also has": [name for name in shapes if name not in needed],
             "has in another shape": [n for n in needed if shapes.get(n, needed[n]) != needed[n]],
         }
-        told = [f"{fault} {len(n)} (such as {n[0]})" for fault, n in faults.items() if n]
-        if told:
+        described = [f"{fault} {len(n)} (such as {n[0]})" for fault, n in faults.items() if n]
+        if described:
             raise LaeError(
                 f"{self._snapshot}: not weights of the model of {self._config}: "
-                f"of {len(needed)} tensors it {', '.join(told)}"
+                f"of {len(needed)} tensors it {', '.join(described)}"
             )
         return weights
 

@@ -22,11 +22,10 @@ from lae_sim.trackers.checkout import (
     explained,
     import_from,
     replaced,
-    sha256,
     stand_ins,
     torch_on,
 )
-from lae_sim.trackers.protocol import Box, Image, Output
+from lae_sim.trackers.protocol import Box, Image, Output, weights_digest
 
 # what the toolkit imports for training, data sets, drawing and other trackers
 _UNUSED = (
@@ -153,11 +152,11 @@ class PyTracking:
 
     def track(self, frame: Image) -> Output:
         """Find the target in the next frame."""
-        found = self._tracker.track(self._rgb(frame))
-        box = [float(value) for value in found["target_bbox"]]
+        output = self._tracker.track(self._rgb(frame))
+        box = [float(value) for value in output["target_bbox"]]
         if box == [-1, -1, -1, -1]:
             return None
-        score = found.get("object_presence_score", self._tracker.debug_info.get("max_score"))
+        score = output.get("object_presence_score", self._tracker.debug_info.get("max_score"))
         return box if score is None else (box, float(score))
 
     def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
@@ -181,7 +180,7 @@ class PyTracking:
             "name": f"{settings['tracker']}-{settings['parameter']}",
             "version": commit(self._checkout),
             "settings": dict(settings),
-            "weights_digest": sha256(self._network),
+            "weights_digest": weights_digest(self._network),
             "libraries": {"cuda": self._torch.version.cuda},
         }
 
@@ -208,10 +207,10 @@ class PyTracking:
             self._tracker = self._class(self._params)
             self._tracker.initialize_features()
         network = self._holders[0].net
-        found = type(network).__name__
-        if found != _NETWORKS.get(tracker, found):
+        kind = type(network).__name__
+        if kind != _NETWORKS.get(tracker, kind):
             raise LaeError(
-                f"{self._network}: {tracker} takes a {_NETWORKS[tracker]}, this is a {found}"
+                f"{self._network}: {tracker} takes a {_NETWORKS[tracker]}, this is a {kind}"
             )
         self._settings["network"] = network.constructor.fun_name  # such as dimpnet18
 

@@ -7,13 +7,11 @@ import math
 import os
 import platform
 import sys
-import textwrap
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter_ns, process_time_ns
 from typing import Any
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, described
 from lae_sim.trackers.names import make_tracker
 from lae_sim.trackers.protocol import Image
 
@@ -87,8 +85,8 @@ class Stopwatch:
 
     def describe(self) -> dict[str, Any]:
         """What the tracker says of itself, and its interpreter and libraries, as JSON values."""
-        found: dict[str, Any] = _explained(self._description)
-        return found
+        description: dict[str, Any] = _explained(self._description)
+        return description
 
     def close(self) -> None:
         """Have the tracker give its resources back."""
@@ -96,7 +94,7 @@ class Stopwatch:
 
     def _description(self) -> Any:
         own: Mapping[str, Any] = getattr(self._tracker, "describe", dict)()
-        found = {
+        description = {
             **own,
             "python": platform.python_version(),
             "libraries": {**_versions(), **own.get("libraries", {})},
@@ -104,7 +102,7 @@ class Stopwatch:
             "synchronised": self._sync is not _cuda_at_rest or _torch_on_cuda() is not None,
             **_cuda(),
         }
-        return json.loads(json.dumps(found, default=_text))
+        return json.loads(json.dumps(description, default=_text))
 
     def _timed(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, int, int]:
         self._sync()
@@ -139,10 +137,7 @@ def _explained(call: Callable[..., Any], *arguments: Any, **options: Any) -> Any
     except LaeError:
         raise
     except (Exception, SystemExit) as error:  # some scripts exit where they should raise
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        message = textwrap.shorten(str(error), 300)
-        text = f"{type(error).__name__}: {message} ({place.filename}, line {place.lineno})"
-        raise LaeError(text) from error
+        raise LaeError(described(error)) from error
 
 
 def _plain(output: Any) -> Any:
@@ -170,19 +165,19 @@ def _is_number(value: Any) -> bool:
 
 
 def _versions() -> dict[str, str]:
-    found = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
-    found["opencv"] = found.pop("cv2")
-    return {name: str(version) for name, version in found.items() if version is not None}
+    versions = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
+    versions["opencv"] = versions.pop("cv2")
+    return {name: str(version) for name, version in versions.items() if version is not None}
 
 
 def _threads() -> dict[str, Any]:
-    found: dict[str, Any] = {n: os.environ[n] for n in THREAD_VARIABLES if n in os.environ}
+    threads: dict[str, Any] = {n: os.environ[n] for n in THREAD_VARIABLES if n in os.environ}
     cv2, torch = sys.modules.get("cv2"), sys.modules.get("torch")
     if cv2:
-        found["opencv"] = cv2.getNumThreads()
+        threads["opencv"] = cv2.getNumThreads()
     if torch:
-        found["torch"] = torch.get_num_threads()
-    return found
+        threads["torch"] = torch.get_num_threads()
+    return threads
 
 
 def _cuda() -> dict[str, Any]:
@@ -190,10 +185,10 @@ def _cuda() -> dict[str, Any]:
     torch = sys.modules.get("torch")
     if not torch or not torch.version.cuda:
         return {}
-    found = {"cuda": torch.version.cuda, "cudnn": torch.backends.cudnn.version()}
+    cuda = {"cuda": torch.version.cuda, "cudnn": torch.backends.cudnn.version()}
     if _torch_on_cuda():
-        found["gpu"] = torch.cuda.get_device_name()
-    return found
+        cuda["gpu"] = torch.cuda.get_device_name()
+    return cuda
 
 
 def _text(value: Any) -> Any:

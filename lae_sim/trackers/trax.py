@@ -100,11 +100,11 @@ class Trax:
             return box
 
     def describe(self) -> dict[str, Any]:
-        """What the program told of itself, and how it was started."""
+        """What the program says of itself, and how it was started."""
         from importlib.metadata import version
 
         return {
-            **self._told,
+            **self._description,
             "settings": {"command": self._command, **self._parameters},
             "libraries": {"trax": version("vot-trax")},
         }
@@ -143,8 +143,8 @@ class Trax:
         self._client, self._fresh = client, True
         self._wrapped = client.get("vot") is not None
         self._lasting = self._lasting and not self._wrapped
-        told = {key: getattr(client, "tracker_" + key) for key in ("name", "family", "description")}
-        self._told = {key: text for key, text in told.items() if text}
+        texts = {k: getattr(client, f"tracker_{k}") for k in ("name", "family", "description")}
+        self._description = {key: text for key, text in texts.items() if text}
 
     def _hand_over(self, frame: Image) -> dict[str, Any]:
         """The frame as the program takes it; a file stays as it is until the frame after next."""
@@ -170,8 +170,8 @@ class Trax:
         except BaseException:  # the answer would be taken for that of the next call
             self._end()
             raise
-        found: tuple[Any, dict[str, str]] = objects[0]
-        return found
+        region: tuple[Any, dict[str, str]] = objects[0]
+        return region
 
     def _failure(self, reason: str) -> LaeError:
         """End the program; why."""
@@ -179,9 +179,9 @@ class Trax:
             reason = f"it ended with status {self._process.wait(PATIENCE_S)} ({reason})"
         self._log.seek(max(self._log.seek(0, os.SEEK_END) - 1000, 0))
         lines = self._log.read().decode(errors="replace").split("\n")
-        said = [line.strip() for line in lines if line.strip()]
+        printed = [line.strip() for line in lines if line.strip()]
         self._end()
-        return LaeError(": ".join([f"trax:{self._command}", reason, *said[-1:]]))
+        return LaeError(": ".join([f"trax:{self._command}", reason, *printed[-1:]]))
 
     def _end(self) -> None:
         self._client = None

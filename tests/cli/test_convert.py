@@ -289,9 +289,9 @@ def scores(path):
     runs = [replay_sequence(recording, Clock.at(trace.metadata.fps)) for recording in trace]
     found = evaluate(runs, trace.metadata, {"hold": load_forecaster("hold")})
     return (
-        int(found.frames.sum()),
-        int(found.processed.sum()),
-        int(found.mismatch_sum.sum()),
+        int(found.replay.frames.sum()),
+        int(found.replay.processed.sum()),
+        int(found.staleness.mismatch_sum.sum()),
         round(float(found.scores["auc"].mean()), 4),
         round(float(found.scores["dp20"].mean()), 4),
     )

@@ -103,9 +103,9 @@ def test_json_agrees_with_the_api():
     forecasters = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
     sigmas = [Fraction(0), Fraction(1, 2)]
     found = lae_sim.evaluate(runs, trace.metadata, forecasters, sigmas)
-    assert report["world_frames"] == found.frames.sum() == trace.frames
-    assert report["processed"] == found.processed.sum()
-    assert report["mismatch_sum"] == found.mismatch_sum[:, 0].sum()
+    assert report["world_frames"] == found.replay.frames.sum() == trace.frames
+    assert report["processed"] == found.replay.processed.sum()
+    assert report["mismatch_sum"] == found.staleness.mismatch_sum[:, 0].sum()
     assert [(r["forecaster"], r["sigma"]) for r in report["results"]] == [
         ("hold", 0.0), ("hold", 0.5), ("kalman", 0.0), ("kalman", 0.5),
     ]  # fmt: skip

@@ -142,11 +142,11 @@ def test_every_row_is_what_replaying_and_scoring_one_by_one_gives(tmp_path: Path
                             assert row["auc"] == found.scores["auc"][f, s, m]
                             assert row["norm_auc"] == found.scores["norm_auc"][f, s, m]
                             assert row["offline_dp20"] == found.offline["dp20"][s]
-                            assert row["processed"] == found.processed[s]
-                            assert row["mismatch_max"] == found.mismatch_max[s, m]
-                            assert row["longest_hold"] == found.longest_hold[s, m]
+                            assert row["processed"] == found.replay.processed[s]
+                            assert row["mismatch_max"] == found.staleness.mismatch_max[s, m]
+                            assert row["longest_hold"] == found.staleness.longest_hold[s, m]
                             assert row["failure_frame"] == found.failure[f, s, m]
-                            assert row["approximate_outputs"] == found.departures[s]
+                            assert row["approximate_outputs"] == found.replay.departures[s]
                             assert row["elapsed_ms"] == pytest.approx(
                                 runs[s].schedule.elapsed_ns[1:].mean() / 1e6
                             )
@@ -170,10 +170,14 @@ def test_the_summary_has_the_means_of_replay(tmp_path: Path) -> None:
     assert kalman["auc_low"] < kalman["auc"] < kalman["auc_high"]
     first = rows["synthetic-slow", "hold", "0"]
     assert first["auc"] == pytest.approx(found.scores["auc"][0, :, 0].mean())
-    mismatch = found.mismatch_sum[:, 0].sum() / found.frames.sum()
+    mismatch = found.staleness.mismatch_sum[:, 0].sum() / found.replay.frames.sum()
     assert first["age_ms"] == pytest.approx(1000 / 30 * mismatch)
-    assert first["longest_stale_ms"] == pytest.approx(1000 / 30 * found.longest_hold[:, 0].max())
-    assert first["skip_rate"] == pytest.approx(1 - found.processed.sum() / found.frames.sum())
+    assert first["longest_stale_ms"] == pytest.approx(
+        1000 / 30 * found.staleness.longest_hold[:, 0].max()
+    )
+    assert first["skip_rate"] == pytest.approx(
+        1 - found.replay.processed.sum() / found.replay.frames.sum()
+    )
     assert "auc_low" not in rows["synthetic-slow", "hold", "1/50"]
 
 

@@ -93,7 +93,7 @@ def test_a_part_of_the_same_video_counts_as_seen() -> None:
     rule = Learned(None, {"sequences": ["car1_1", "bus"]})
     camera = CameraCompensated(Windowed(rule), Camera({}, Fraction(30)))
     forecasters = {"hold": Hold, "one": Windowed(rule), "two": camera}
-    notes = notes_on(found, metadata, PYSOT, forecasters)
+    notes = notes_on(found.replay, metadata, PYSOT, forecasters)
     assert ["trained on 1 of these 2 sequences" in note for note in notes] == [True, True]
     assert [note.split(":")[0].split()[0] for note in notes] == ["one", "two"]
 

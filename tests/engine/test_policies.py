@@ -6,13 +6,21 @@ import math
 from collections.abc import Sequence
 from fractions import Fraction
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from witness import RATES, SECOND, times
 
 from lae_sim.engine.clock import Clock
-from lae_sim.engine.policies import every, fifo, latest, shrinking_tail, vot_realtime
+from lae_sim.engine.policies import (
+    LanePolicy,
+    every,
+    fifo,
+    latest,
+    shrinking_tail,
+    vot_realtime,
+)
 from lae_sim.engine.scheduler import Policy, simulate
 from lae_sim.errors import LaeError
 
@@ -77,6 +85,34 @@ def test_every_0_cannot_move_forward() -> None:
 def test_every_1_is_fifo() -> None:
     elapsed = [10, 90, 15, 3, 60, 10, 10, 200, 1]
     assert run(elapsed, every(1)) == run(elapsed, fifo)
+
+
+@given(
+    data=st.data(),
+    fps=st.sampled_from(RATES).map(Fraction),
+    policy=st.sampled_from(
+        [
+            latest,
+            fifo,
+            every(3),
+            every(10**18),
+            *(shrinking_tail(ns=r * MS) for r in (0, 47, 10**9)),
+        ]
+    ),
+)
+def test_a_policy_answers_for_lanes_as_for_each(
+    data: st.DataObject, fps: Fraction, policy: LanePolicy
+) -> None:
+    clock = Clock.at(fps)
+    last = data.draw(st.lists(st.integers(0, 500), min_size=1, max_size=9))
+    # as it becomes free no sooner than the frame that it processed has arrived
+    now = [i * clock.frame_ticks + data.draw(st.integers(0, 5 * clock.frame_ticks)) for i in last]
+    found = policy.next_lanes(clock, np.array(last), np.array(now))
+    alone = [policy(clock, [(i, i * clock.frame_ticks, t)]) for i, t in zip(last, now)]
+    assert found.tolist() == [frame for frame, _ in alone]
+    assert [start for _, start in alone] == [
+        max(t, frame * clock.frame_ticks) for (frame, _), t in zip(alone, now)
+    ]
 
 
 # ------------------------------------------------------------------------------ shrinking tail

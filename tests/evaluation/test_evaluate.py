@@ -122,8 +122,8 @@ def test_curves_and_failures_agree_with_those_of_single_sequences(
                 assert found.failure[f, s, m] == min(apart, default=len(run))
             boxes = answers(run, EVERY, forecaster, factory, sigmas[0]).boxes
             for curves, curve, metric in (
-                (found.success, success_curve, "auc"),
-                (found.precision, precision_curve, "dp20"),
+                (found.curves.success, success_curve, "auc"),
+                (found.curves.precision, precision_curve, "dp20"),
             ):
                 if math.isnan(found.scores[metric][f, s, 0]):
                     assert np.isnan(curves[f, s]).all()
@@ -159,10 +159,10 @@ def test_evaluation_agrees_with_the_event_driven_world(
         processed, tellings = event_driven(
             fps, recording.elapsed_ns.tolist(), recording.boxes.tolist(), sigmas
         )
-        assert found.processed[s] == len(processed)
+        assert found.replay.processed[s] == len(processed)
         lags = [[i - source for i, source in enumerate(told.psi)] for told in tellings]
-        assert found.mismatch_sum[s].tolist() == [sum(lag) for lag in lags]
-        assert found.mismatch_max[s].tolist() == [max(lag) for lag in lags]
+        assert found.staleness.mismatch_sum[s].tolist() == [sum(lag) for lag in lags]
+        assert found.staleness.mismatch_max[s].tolist() == [max(lag) for lag in lags]
 
 
 @given(groups(), st.booleans())
@@ -184,8 +184,8 @@ def test_the_grid_is_its_sigmas_one_by_one_and_groups_are_their_sequences(
                 np.testing.assert_array_equal(
                     together.scores[metric][:, s, m], alone.scores[metric][:, 0, 0]
                 )
-            assert together.mismatch_sum[s, m] == alone.mismatch_sum[0, 0]
-            assert together.longest_hold[s, m] == alone.longest_hold[0, 0]
+            assert together.staleness.mismatch_sum[s, m] == alone.staleness.mismatch_sum[0, 0]
+            assert together.staleness.longest_hold[s, m] == alone.staleness.longest_hold[0, 0]
 
 
 def test_streaming_and_lane_forecasters_score_the_same() -> None:
@@ -242,17 +242,17 @@ def test_counts_by_hand() -> None:
     run = replay_sequence(recording, Clock.at(Fraction(25)))
     assert run.schedule.frames.tolist() == [0, 2, 3, 4]
     found = evaluate([run], EVERY, {"hold": Hold}, [Fraction(0), Fraction(1, 2)])
-    assert found.sequences == ("a",)
-    assert found.frames.tolist() == [5]
-    assert found.processed.tolist() == [4]
-    assert found.departures.tolist() == [1]
-    assert found.init_ns.tolist() == [100_000_000]
-    assert found.calls_ns.tolist() == [60_000_000]
-    assert found.calls_hz.tolist() == [np.inf]  # a call took 0 ns
+    assert found.replay.sequences == ("a",)
+    assert found.replay.frames.tolist() == [5]
+    assert found.replay.processed.tolist() == [4]
+    assert found.replay.departures.tolist() == [1]
+    assert found.replay.init_ns.tolist() == [100_000_000]
+    assert found.replay.calls_ns.tolist() == [60_000_000]
+    assert found.replay.calls_hz.tolist() == [np.inf]  # a call took 0 ns
     # sigma 0: psi = 0 0 0 0 4; sigma 1/2: queries at 20, 60, 100, 140, 180: psi = 0 0 0 2 4
-    assert found.mismatch_sum.tolist() == [[6, 4]]
-    assert found.mismatch_max.tolist() == [[3, 2]]
-    assert found.longest_hold.tolist() == [[4, 3]]
+    assert found.staleness.mismatch_sum.tolist() == [[6, 4]]
+    assert found.staleness.mismatch_max.tolist() == [[3, 2]]
+    assert found.staleness.longest_hold.tolist() == [[4, 3]]
 
 
 def test_offline_scores_need_every_frame() -> None:
@@ -273,11 +273,12 @@ def test_joined_is_the_evaluation_of_all() -> None:
 
     whole = of(runs)
     joined = Evaluation.joined([of(runs[a:b]) for a, b in pairwise([0, 2, 3, 5])])
-    assert joined.sequences == whole.sequences
+    assert joined.replay.sequences == whole.replay.sequences
     for field in ("frames", "processed", "departures", "init_ns", "calls_ns", "calls_hz"):
-        assert getattr(joined, field).tolist() == getattr(whole, field).tolist()
+        assert getattr(joined.replay, field).tolist() == getattr(whole.replay, field).tolist()
     for field in ("mismatch_sum", "mismatch_max", "longest_hold"):
-        assert getattr(joined, field).tolist() == getattr(whole, field).tolist()
+        both = getattr(joined.staleness, field), getattr(whole.staleness, field)
+        assert both[0].tolist() == both[1].tolist()
     for metric in METRICS:
         assert joined.scores[metric].tobytes() == whole.scores[metric].tobytes()
         assert joined.offline[metric].tobytes() == whole.offline[metric].tobytes()
@@ -289,7 +290,7 @@ def test_vot_scores_each_output_at_its_own_frame() -> None:
     found = evaluate([run], EVERY, {"hold": Hold})
     for metric in METRICS:
         assert found.scores[metric].item() == found.offline[metric].item()
-    assert found.mismatch_sum.item() == 0
+    assert found.staleness.mismatch_sum.item() == 0
 
 
 def test_a_forecaster_that_answers_nonsense_is_named() -> None:

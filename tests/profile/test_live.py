@@ -221,7 +221,7 @@ def test_a_first_box_that_cannot_be_used(box: list[float], message: str) -> None
     [
         (np.zeros((64, 96), np.uint8), "uint8"),
         (np.zeros((64, 96, 3), np.uint16), "uint16"),
-        (np.zeros((64, 96, 4), np.uint8), r"\(64, 96, 4\)"),
+        (np.zeros((64, 96, 4), np.uint8), r"\[64, 96, 4\]"),
         (np.zeros((32, 96, 3), np.uint8), "is 96x32, and the first one 96x64"),
     ],
 )

@@ -172,7 +172,7 @@ def test_frames_of_any_size_arrive_whole_and_are_the_trackers_own(
 )
 def test_what_is_no_frame_is_refused(make: Callable[..., TimedTracker], frame: Any) -> None:
     tracker = make()
-    with pytest.raises(LaeError, match="a frame is uint8"):
+    with pytest.raises(LaeError, match="a frame must be uint8"):
         tracker.init(frame, BOX)
     with pytest.raises(LaeError, match="four finite numbers"):
         tracker.init(FRAME, (1, 2, float("nan"), 4))

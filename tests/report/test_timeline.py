@@ -15,6 +15,7 @@ from places import REPOSITORY
 from trace_processor import queried
 
 import lae_sim
+from lae_sim.evaluation.evaluate import evaluate_groups
 from lae_sim.report.timeline import timeline_file, trace_events
 
 SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
@@ -256,8 +257,9 @@ def test_what_cannot_be_drawn_is_said_and_leaves_nothing(arguments, words, tmp_p
 
 def test_a_failure_leaves_no_timeline(tmp_path):
     def fails():
-        with timeline_file(str(tmp_path / "o.json"), Fraction(0), {}) as sink:
-            sink(run())
+        metadata, forecasters = lae_sim.Metadata.new("30", "every-frame"), {"hold": lae_sim.Hold}
+        with timeline_file(str(tmp_path / "o.json"), Fraction(0), {}) as observer:
+            list(evaluate_groups([run()], metadata, forecasters, observers=[observer]))
             raise RuntimeError
 
     with pytest.raises(RuntimeError):

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from lae_sim.errors import LaeError
-from lae_sim.trackers.checkout import commit, explained, replaced, sha256, stand_ins
+from lae_sim.trackers.checkout import commit, explained, replaced, stand_ins
+from lae_sim.trackers.protocol import weights_digest
 
 HASH = "0123456789" * 4
 
@@ -79,6 +80,8 @@ def test_explained() -> None:
         raise LaeError("as it is")
 
 
-def test_sha256(tmp_path: Path) -> None:
+def test_weights_digest(tmp_path: Path) -> None:
     (tmp_path / "abc").write_bytes(b"abc")
-    assert sha256(tmp_path / "abc").startswith("ba7816bf8f01cfea414140de5dae2223b00361a39617")
+    assert weights_digest(tmp_path / "abc").startswith(
+        "ba7816bf8f01cfea414140de5dae2223b00361a39617"
+    )

@@ -1,0 +1,175 @@
+"""Sums over sequences, taken group after group: what means need, however many sequences there are.
+
+A replay's report says means over all sequences. Their scores at 51 permitted latencies are some
+thousand numbers a sequence, and the curves another two hundred: no more of them is kept than their
+sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lae_sim._arrays import Floats, Ints
+from lae_sim.evaluation.evaluate import Curves, Evaluation, ReplayStatistics, Staleness
+from lae_sim.evaluation.metrics import METRICS
+
+RECOVERED = ("auc", "dp20")
+"""The metrics of which a share of the latency loss can be recovered."""
+
+
+class Mean:
+    """A mean over sequences of arrays of numbers, of which those that are NaN leave it."""
+
+    def __init__(self) -> None:
+        self.total: Floats = np.zeros(())
+        self._counts: Ints = np.zeros((), np.int64)
+
+    def add(self, values: Floats, axis: int = -1) -> None:
+        """Add some sequences, one after another along an axis."""
+        known = ~np.isnan(values)
+        values = np.ascontiguousarray(values if known.all() else np.where(known, values, 0.0))
+        self.total = self.total + values.sum(axis=axis)
+        self._counts = self._counts + known.sum(axis=axis)
+
+    @property
+    def value(self) -> Floats:
+        """The mean so far; NaN of nothing."""
+        return self.total / np.where(self._counts > 0, self._counts, np.nan)
+
+
+class ScoreTotals:
+    """Scores of F forecasters at M permitted latencies, added up over sequences.
+
+    Attributes:
+        sequences: how many there are.
+        complete: whether the trace holds every frame of all of them.
+    """
+
+    def __init__(self, hold: int) -> None:
+        """With the index of the forecaster that others are to do better than."""
+        self.sequences = 0
+        self.complete = True
+        self._hold = hold
+        self._scores = {metric: Mean() for metric in METRICS}
+        self._offline = {metric: Mean() for metric in METRICS}
+        self._won = {metric: Mean() for metric in RECOVERED}
+        self._lost = {metric: Mean() for metric in RECOVERED}
+
+    def add(self, part: Evaluation, which: slice | Sequence[int] = slice(None)) -> None:
+        """Add some sequences of a part."""
+        missing = part.replay.missing[which]
+        self.sequences += len(missing)
+        self.complete = self.complete and not missing.any()
+        for metric in METRICS:
+            scores = part.scores[metric][:, which].transpose(0, 2, 1)  # [F, M, S]
+            offline = part.offline[metric][which]
+            self._scores[metric].add(scores)
+            self._offline[metric].add(offline)
+            if metric in RECOVERED and self.complete:
+                hold = scores[self._hold]
+                won, lost = scores - hold, np.broadcast_to(offline - hold, scores.shape)
+                counted = ~np.isnan(won + lost)
+                self._won[metric].add(np.where(counted, won, np.nan))
+                self._lost[metric].add(np.where(counted, lost, np.nan))
+
+    def mean(self, metric: str) -> Floats:
+        """Mean scores, float64 [F, M]; NaN if no sequence counts."""
+        return self._scores[metric].value
+
+    def offline(self, metric: str) -> float:
+        """The mean of the trace's own boxes; NaN unless it is complete and a sequence counts."""
+        return float(self._offline[metric].value) if self.complete else np.nan
+
+    def won(self, metric: str) -> Floats:
+        """How much better than hold, added up over the sequences that count, float64 [F, M]."""
+        return self._won[metric].total
+
+    def lost(self, metric: str) -> Floats:
+        """How much better than hold the offline scores are, over the same sequences, [F, M]."""
+        return self._lost[metric].total
+
+
+class CurveTotals:
+    """Mean success and precision curves of F forecasters and of the offline boxes.
+
+    Attributes:
+        complete: whether the trace holds every frame of all sequences.
+    """
+
+    def __init__(self) -> None:
+        self.complete = True
+        self._means = tuple(Mean() for _ in range(4))
+
+    def add(self, part: Evaluation) -> None:
+        """Add the sequences of a part."""
+        self.complete = self.complete and not part.replay.missing.any()
+        arrays = (
+            part.curves.success,
+            part.curves.precision,
+            part.offline_curves.success,
+            part.offline_curves.precision,
+        )
+        for mean, values in zip(self._means, arrays):
+            mean.add(values, axis=-2)
+
+    def curves(self, f: int) -> Curves:
+        """Those of a forecaster, NaN if no sequence counts."""
+        success, precision, *_ = self._means
+        return Curves(success.value[f], precision.value[f])
+
+    @property
+    def offline(self) -> Curves:
+        """Those of the offline boxes, NaN if no sequence has all of them and counts."""
+        *_, success, precision = self._means
+        return Curves(success.value, precision.value)
+
+
+class Totals:
+    """All that is said of a trace as a whole.
+
+    Attributes:
+        scores: over all sequences.
+        by_attribute: over those of each attribute.
+        curves: over all sequences.
+    """
+
+    def __init__(self, hold: int) -> None:
+        """With the index of the forecaster that others are to do better than."""
+        self.scores = ScoreTotals(hold)
+        self.by_attribute: dict[str, ScoreTotals] = {}
+        self.curves = CurveTotals()
+        self._hold = hold
+        self._replays: list[ReplayStatistics] = []
+        self._staleness: list[Staleness] = []
+
+    def add(self, part: Evaluation, members: Mapping[str, Sequence[int]] | None = None) -> None:
+        """Add a group, with the indices of its sequences of each attribute."""
+        self.scores.add(part)
+        self.curves.add(part)
+        for name, which in (members or {}).items():
+            self.by_attribute.setdefault(name, ScoreTotals(self._hold)).add(part, which)
+        self._replays.append(part.replay)
+        staleness = part.staleness
+        self._staleness.append(
+            Staleness(
+                staleness.mismatch_sum.sum(axis=0, keepdims=True),
+                staleness.mismatch_max.max(axis=0, keepdims=True),
+                staleness.longest_hold.max(axis=0, keepdims=True),
+            )
+        )
+
+    @property
+    def replay(self) -> ReplayStatistics:
+        """How all sequences were replayed."""
+        return ReplayStatistics.joined(self._replays)
+
+    @property
+    def staleness(self) -> Staleness:
+        """How old the answers are over all sequences: the sum and the maxima, int64 [M]."""
+        return Staleness(
+            np.sum([each.mismatch_sum for each in self._staleness], axis=(0, 1)),
+            np.max([each.mismatch_max for each in self._staleness], axis=(0, 1)),
+            np.max([each.longest_hold for each in self._staleness], axis=(0, 1)),
+        )
