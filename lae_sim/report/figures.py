@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Floats
+from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS
 from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.evaluation.totals import CurveTotals
@@ -38,8 +39,16 @@ Curves = dict[str, tuple[Floats, Floats]]
 """By name: success over IoU thresholds, and precision over 0..50 px, mean over sequences."""
 
 
-def mean_curves(totals: CurveTotals, forecasters: Sequence[str]) -> Curves:
-    """Mean curves by name, of sequences that have been scored; offline too where it is known."""
+def mean_curves(scored: Evaluation | CurveTotals, forecasters: Iterable[str]) -> Curves:
+    """Mean curves by name; also of the offline boxes, where the trace holds every frame.
+
+    Args:
+        scored: sequences, or what they add up to, at their first permitted latency.
+        forecasters: names of the forecasters that were scored.
+    """
+    totals = scored if isinstance(scored, CurveTotals) else CurveTotals()
+    if isinstance(scored, Evaluation):
+        totals.add(scored)
     means = {name: totals.curves(f) for f, name in enumerate(forecasters)}
     if totals.complete:
         means = {"offline": totals.offline, **means}

@@ -106,7 +106,7 @@ def page(view: View) -> str:
         "base64": lambda data: base64.b64encode(data).decode(),
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),
     }
-    datasets = dict.fromkeys(printable(row["dataset"]) for row in view.results.summary)
+    datasets = dict.fromkeys(printable(row.dataset) for row in view.results.summary)
     return environment.get_template("page.html").render(
         title=f"Latency-aware study: {', '.join(datasets)}",
         facts=_facts(view),
@@ -126,18 +126,18 @@ def page_file(name: str) -> str:
 def _facts(view: View) -> dict[str, str]:
     """What was studied, in a few lines."""
     rows, results = view.rows, view.results
-    shares = [row["approximate_share"] for row in rows if not row["exact"]]
+    shares = [row.approximate_share for row in rows if not row.exact]
     replays = "every replay is exact"
     if shares:
         replays = (
-            f"{sum(row['exact'] for row in rows):,} of {len(rows):,} rows are exact; in the others "
+            f"{sum(row.exact for row in rows):,} of {len(rows):,} rows are exact; in the others "
             f"up to {100 * max(shares):.3g}% of the outputs follow another frame than when "
             "recorded, which makes a tracker that remembers look better than it is"
         )
-    repeated = max(row["repetitions"] for row in rows)
+    repeated = max(row.repetitions for row in rows)
     facts = {
-        "traces": f"{len(results.traces)}; trackers: {len({row['tracker'] for row in rows})}",
-        "forecasters": ", ".join(dict.fromkeys(row["forecaster"] for row in rows)),
+        "traces": f"{len(results.traces)}; trackers: {len({row.tracker for row in rows})}",
+        "forecasters": ", ".join(dict.fromkeys(row.forecaster for row in rows)),
         "cells": f"{len(results.plan.cells):,}, {len(results.failures):,} pieces failed",
         "repetitions": f"{repeated:,} of random latencies" if repeated > 1 else "1",
         "replays": replays,
@@ -155,7 +155,7 @@ def _facts(view: View) -> dict[str, str]:
 
 def _sections(view: View) -> Iterator[Section]:
     results = view.results
-    failures = [f"{failure['of']}: {failure['reason']}" for failure in results.failures]
+    failures = [f"{failure.of}: {failure.reason}" for failure in results.failures]
     yield Section("failures", "Failures", texts=failures)
     ranking = study_tables.ranking(view)
     meanings = {column.title: column.meaning for column in ranking.columns if column.meaning}
@@ -183,7 +183,7 @@ def _sections(view: View) -> Iterator[Section]:
         _provenance(trace, digests.get(trace["trace"], "unknown")) for trace in results.traces
     ]
     yield Section("traces", "Traces", entries=traces)
-    used = dict.fromkeys(row["convention"] for row in results.summary)
+    used = dict.fromkeys(row.convention for row in results.summary)
     conventions = {name: convention_in_words(CONVENTIONS[name]) for name in used}
     yield Section("conventions", "Conventions", facts=conventions)
     yield Section("notes", "Notes", texts=results.notes())

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lae_sim.comparison.statistics import ALL_TRACES
+from lae_sim.comparison.statistics import ALL_TRACES, Interval
 from lae_sim.engine.clock import parse_duration
 from lae_sim.report.figures import Curve, Line, Panel, draw_curves, draw_sweep
-from lae_sim.report.study_view import SETTINGS, View, row_of, run_of, setting_of, shared_setting
+from lae_sim.report.study_view import SETTINGS, View, run_of, setting_of, shared_setting
 from lae_sim.report.style import (
     BLUE,
     GREY,
@@ -32,13 +32,12 @@ from lae_sim.report.style import (
     tracker_styles,
 )
 from lae_sim.report.table import printable
-from lae_sim.study.summary import MEAN, Scores
+from lae_sim.study.records import MEAN, SummaryRow
+from lae_sim.study.summary import Scores
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Row = Mapping[str, Any]
 
 MOST_CURVES, MOST_PAIRS, MOST_BARS, MOST_HISTOGRAMS = 8, 6, 30, 30
 """What one picture holds of curves, rows and histograms, and how many curve pictures there are."""
@@ -77,11 +76,11 @@ def _label(view: View, run: str, forecaster: str) -> str:
     return f"{_short(view.names[run])}, {_short(forecaster)}"
 
 
-def _best_runs(view: View, aucs: Sequence[tuple[str, float | None]]) -> tuple[list[str], str]:
+def _best_runs(view: View, rows: Sequence[SummaryRow]) -> tuple[list[str], str]:
     """The runs of the best trackers, as many as a panel may hold, and what was left out."""
     best: dict[str, float] = {}
-    for run, auc in aucs:
-        best[run] = max(best.get(run, 0), auc or 0)
+    for row in rows:
+        best[run_of(row)] = max(best.get(run_of(row), 0), row.scores["auc"] or 0)
     shown = max(1, MOST_CURVES // len(view.forecasters))
     kept = sorted(best, key=lambda run: -best[run])[:shown]
     left_out = f"; the best {len(kept)} of {len(best)} trackers" if len(kept) < len(best) else ""
@@ -94,14 +93,14 @@ def curves(view: View) -> Iterator[Picture]:
     for scores in view.results.scores:
         groups.setdefault(scores.group, []).append(scores)
     ordered = sorted(
-        groups.values(), key=lambda group: not any(view.stands(row_of(s)) for s in group)
+        groups.values(), key=lambda group: not any(view.stands(view.row_of(s)) for s in group)
     )
     for group in ordered[:MOST_PAIRS]:
-        kept, left_out = _best_runs(view, [(run_of(row_of(s)), _mean(s)) for s in group])
-        shown = [scores for scores in group if run_of(row_of(scores)) in kept]
-        rows = [row_of(scores) for scores in shown]
+        kept, left_out = _best_runs(view, [view.row_of(scores) for scores in group])
+        shown = [scores for scores in group if scores.setting.run in kept]
+        rows = [view.row_of(scores) for scores in shown]
         yield Picture(
-            f"{printable(rows[0]['dataset'])}: {shared_setting(rows)}{left_out}. In brackets: AUC, "
+            f"{printable(rows[0].dataset)}: {shared_setting(rows)}{left_out}. In brackets: AUC, "
             "and precision at 20 px.",
             svg_of(draw_curves([curve for scores in shown for curve in _curves(view, scores)])),
         )
@@ -110,14 +109,9 @@ def curves(view: View) -> Iterator[Picture]:
         yield Picture(f"{left} more settings are in the ranking, and not drawn here.", b"")
 
 
-def _mean(scores: Scores) -> float:
-    known = scores.means["auc"][:, 0]
-    return float(np.nanmean(known)) if (known == known).any() else 0.0
-
-
 def _curves(view: View, scores: Scores) -> Iterator[Curve]:
     """The curve of a forecaster; before that of hold, the offline one."""
-    run, styles, cells = run_of(row_of(scores)), _styles(view), scores.about
+    run, styles, cells = scores.setting.run, _styles(view), scores.about
     weights = [cell["repetitions"] for cell in cells]
     names = {"offline": "offline_"} if scores.forecaster == "hold" else {}
     for name, prefix in {**names, scores.forecaster: ""}.items():
@@ -140,42 +134,42 @@ SWEEPS = {
 
 def sweep(view: View, key: str) -> Picture | None:
     """AUC and DP of each dataset over a key of ``SWEEPS``; None if it has one value only."""
-    points: list[tuple[float, Row]] = []
+    points: list[tuple[float, SummaryRow]] = []
     for row in view.results.summary if key == "sigma" else view.rows:
-        settings = zip(SETTINGS[1:], setting_of(row), view.chosen[run_of(row)])
-        x = _place(key, row[key])
+        settings = zip(SETTINGS, setting_of(row), view.chosen[run_of(row)])
+        x = _place(getattr(row, key))
         if x is not None and all(own == chosen for name, own, chosen in settings if name != key):
             points.append((x, row))
     if len({x for x, _ in points}) < 2:
         return None
     caption = f"Over {SWEEPS[key].split(' (')[0]}: {shared_setting(view.standing, but=key)}"
     panels: list[Panel] = []
-    for dataset in dict.fromkeys(row["dataset"] for _, row in points):
-        within = [(x, row) for x, row in points if row["dataset"] == dataset]
-        kept, left_out = _best_runs(view, [(run_of(row), row["auc"]) for _, row in within])
+    for dataset in dict.fromkeys(row.dataset for _, row in points):
+        within = [(x, row) for x, row in points if row.dataset == dataset]
+        kept, left_out = _best_runs(view, [row for _, row in within])
         caption += left_out and f"{left_out} on {_short(dataset)}"
         shown = [(x, row) for x, row in within if run_of(row) in kept]
         panels += _sweep_panels(view, _short(dataset), shown, key)
     return Picture(caption, svg_of(draw_sweep(panels, 2, sharex=True)))
 
 
-def _place(key: str, value: str) -> float | None:
+def _place(value: str | Fraction) -> float | None:
     """Where a value stands on its axis; None if it is not on it."""
-    if key == "latency":
-        name, _, time = value.partition(":")
-        return parse_duration(time) / 1e6 if name == "constant" else None
-    return None if value == MEAN else float(Fraction(value))
+    if isinstance(value, Fraction):
+        return float(value)
+    latency, _, time = value.partition(":")
+    return parse_duration(time) / 1e6 if latency == "constant" else None
 
 
 def _sweep_panels(
-    view: View, title: str, points: Sequence[tuple[float, Row]], key: str
+    view: View, title: str, points: Sequence[tuple[float, SummaryRow]], key: str
 ) -> Iterator[Panel]:
     """AUC and DP of one dataset."""
-    lines: dict[tuple[str, str], list[tuple[float, Row]]] = {}
+    lines: dict[tuple[str, str], list[tuple[float, SummaryRow]]] = {}
     for x, row in sorted(points, key=lambda point: point[0]):
-        lines.setdefault((run_of(row), row["forecaster"]), []).append((x, row))
-    order = dict.fromkeys((run_of(row), row["forecaster"]) for _, row in points)
-    mean = "m" if points[0][1]["sigma"] == MEAN else ""
+        lines.setdefault((run_of(row), row.forecaster), []).append((x, row))
+    order = dict.fromkeys((run_of(row), row.forecaster) for _, row in points)
+    mean = "m" if points[0][1].sigma == MEAN else ""
     logarithmic = key == "scale" and min(x for x, _ in points) > 0
     styles = _styles(view)
     for metric, name in (("auc", f"{mean}AUC"), ("dp20", f"{mean}DP")):
@@ -183,7 +177,7 @@ def _sweep_panels(
             Line(
                 _label(view, *which),
                 [x for x, _ in lines[which]],
-                np.array([row[metric] for _, row in lines[which]], np.float64),
+                np.array([row.scores[metric] for _, row in lines[which]], np.float64),
                 styles[which],
             )
             for which in order
@@ -193,33 +187,45 @@ def _sweep_panels(
 
 def front(view: View) -> Picture | None:
     """AUC against the time of a call, and the Pareto front of each dataset and forecaster."""
-    rows = [row for row in view.standing if None not in (row["auc"], row["elapsed_ms"])]
-    if not rows:
+    points = [
+        Point(row, row.elapsed_ms, auc)
+        for row in view.standing
+        if row.elapsed_ms is not None and (auc := row.scores["auc"]) is not None
+    ]
+    if not points:
         return None
+    rows = [point.row for point in points]
     caption = "AUC against the mean time of a call; hollow: hold; lines join what no other tracker"
-    return Picture(f"{caption} beats in both: {shared_setting(rows)}", svg_of(_front(view, rows)))
+    return Picture(f"{caption} beats in both: {shared_setting(rows)}", svg_of(_front(view, points)))
+
+
+@dataclass(frozen=True)
+class Point:
+    """A row of the summary with its time of a call (ms) and its AUC, both known."""
+
+    row: SummaryRow
+    ms: float
+    auc: float
 
 
 @styled
-def _front(view: View, rows: Sequence[Row]) -> Figure:
-    datasets = list(dict.fromkeys(row["dataset"] for row in rows))
+def _front(view: View, points: Sequence[Point]) -> Figure:
+    datasets = list(dict.fromkeys(point.row.dataset for point in points))
     columns = min(len(datasets), 2)
     figure, panels = panel_grid(len(datasets), columns, 10 / columns, 3.6)
     styles, lines = _styles(view), forecaster_lines(view.forecasters)
     for axes, dataset in zip(panels, datasets):
-        within = [row for row in rows if row["dataset"] == dataset]
+        within = [point for point in points if point.row.dataset == dataset]
         for forecaster in view.forecasters:
-            best = sorted(
-                (row for row in within if row["forecaster"] == forecaster and row["pareto"]),
-                key=lambda row: row["elapsed_ms"],
-            )
-            xs, ys = [row["elapsed_ms"] for row in best], [row["auc"] for row in best]
+            best = [p for p in within if p.row.forecaster == forecaster and p.row.pareto]
+            best.sort(key=lambda point: point.ms)
             style = {"color": GREY, "linestyle": lines[forecaster], "zorder": 1}
+            xs, ys = [point.ms for point in best], [point.auc for point in best]
             axes.plot(xs, ys, label=f"front, {_short(forecaster)}", **style)
-        for row in within:
-            filled = "full" if row["forecaster"] != "hold" else "none"
-            style = {**styles[run_of(row), "hold"], "linestyle": "", "fillstyle": filled}
-            axes.plot(row["elapsed_ms"], row["auc"], **{**style, "markersize": 7})
+        for point in within:
+            filled = "full" if point.row.forecaster != "hold" else "none"
+            style = {**styles[run_of(point.row), "hold"], "linestyle": "", "fillstyle": filled}
+            axes.plot(point.ms, point.auc, **{**style, "markersize": 7})
         axes.margins(x=0.2, y=0.1)
         _name_trackers(axes, view, within)
         axes.set(xlabel="mean time of a call (ms)", ylabel="AUC", title=_short(dataset))
@@ -227,13 +233,14 @@ def _front(view: View, rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _name_trackers(axes: Axes, view: View, rows: Sequence[Row]) -> None:
+def _name_trackers(axes: Axes, view: View, points: Sequence[Point]) -> None:
     """A label beside each tracker's best point, moved up where one is too near below."""
-    best = {run_of(row): row for row in sorted(rows, key=lambda row: row["auc"])}  # the worst first
+    # the worst first
+    best = {run_of(point.row): point for point in sorted(points, key=lambda point: point.auc)}
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     taken: list[tuple[float, float]] = []
-    for run, row in best.items():
-        x, y, least = row["elapsed_ms"], row["auc"], 0.055 * (high - low)
+    for run, point in best.items():
+        x, y, least = point.ms, point.auc, 0.055 * (high - low)
         for other, height in taken:
             if abs(other - x) < 0.4 * (right - left):
                 y = max(y, height + least)
@@ -248,39 +255,41 @@ def _name_trackers(axes: Axes, view: View, rows: Sequence[Row]) -> None:
 
 def gains(view: View) -> Picture | None:
     """What each forecaster wins over hold for each tracker; None if there is only hold."""
-    rows = [row for row in view.standing if "vs_hold_auc_low" in row]
-    if not rows:
-        return None
     best: dict[str, float] = {}
-    for row in rows:
-        best[run_of(row)] = max(best.get(run_of(row), -1), row["vs_hold_auc"])
+    for row in view.standing:
+        if "auc" in row.uncertainty and (won := row.uncertainty["auc"].vs_hold) is not None:
+            best[run_of(row)] = max(best.get(run_of(row), -1), won.value)
+    if not best:
+        return None
     kept = sorted(best, key=lambda run: -best[run])[:MOST_BARS]
     left_out = f", the {len(kept)} largest of {len(best)}" if len(kept) < len(best) else ""
     caption = f"What forecasters win over hold{left_out}, with 95 % intervals over sequences"
-    rows = [row for row in rows if run_of(row) in kept]
+    rows = [row for row in view.standing if run_of(row) in kept]
     return Picture(f"{caption}: {shared_setting(rows)}", svg_of(_gains(view, rows, kept)))
 
 
 @styled
-def _gains(view: View, rows: Sequence[Row], runs: Sequence[str]) -> Figure:
-    figure = new_figure(10, 1.3 + 0.3 * len(runs) + 0.1 * len(rows))
+def _gains(view: View, rows: Sequence[SummaryRow], runs: Sequence[str]) -> Figure:
+    rivals = [name for name in view.forecasters if name != "hold"]
+    figure = new_figure(10, 1.3 + 0.3 * len(runs) + 0.1 * len(runs) * len(rivals))
     panels = figure.subplots(1, 2, sharey=True)
     styles = forecaster_styles(view.forecasters)
-    rivals = [name for name in view.forecasters if name != "hold"]
-    datasets = {run_of(row): _short(row["dataset"]) for row in rows}
+    datasets = {run_of(row): _short(row.dataset) for row in rows}
     several = len(set(datasets.values())) > 1
-    for axes, key, factor in zip(panels, ("vs_hold_auc", "recovered_auc"), (1, 100)):
+    for axes in panels:
         axes.axvline(0, color=GREY, linewidth=0.8)
-        for row in sorted(rows, key=lambda row: rivals.index(row["forecaster"])):
-            if (value := row.get(key)) is None:
+    for forecaster in rivals:
+        style = {**styles[forecaster], "linestyle": "", "label": _short(forecaster)}
+        aside = 0.7 * ((rivals.index(forecaster) + 0.5) / len(rivals) - 0.5)
+        for row in rows:
+            uncertainty = row.uncertainty.get("auc") if row.forecaster == forecaster else None
+            if uncertainty is None or uncertainty.vs_hold is None:
                 continue
-            forecaster = row["forecaster"]
-            aside = 0.7 * ((rivals.index(forecaster) + 0.5) / len(rivals) - 0.5)
             y = runs.index(run_of(row)) + aside
-            ends = [row[f"{key}_{end}"] for end in ("low", "high") if f"{key}_{end}" in row]
-            style = {**styles[forecaster], "linestyle": ""}
-            axes.plot(np.multiply(factor, ends), [y] * len(ends), color=style["color"])
-            axes.plot(factor * value, y, label=_short(forecaster), **style)
+            won, recovered = uncertainty.vs_hold, uncertainty.recovered
+            _dot(panels[0], y, won.value, won.interval, style)
+            if recovered is not None and recovered.share is not None:
+                _dot(panels[1], y, recovered.share, recovered.interval, style, 100)
     panels[0].set(xlabel="AUC won over hold", ylim=(len(runs) - 0.5, -0.5))
     panels[1].set(xlabel="latency loss recovered (%)")
     low, high = panels[1].get_xlim()
@@ -291,6 +300,16 @@ def _gains(view: View, rows: Sequence[Row], runs: Sequence[str]) -> Figure:
     )
     legend_below(figure)
     return figure
+
+
+def _dot(
+    axes: Axes, y: float, x: float, interval: Interval | None, style: Style, factor: float = 1
+) -> None:
+    """A value and its interval."""
+    if interval is not None:
+        ends = factor * interval.low, factor * interval.high
+        axes.plot(ends, (y, y), color=style["color"])
+    axes.plot(factor * x, y, **style)
 
 
 def attributes(view: View) -> Iterator[Picture]:
@@ -326,7 +345,7 @@ def histograms(view: View) -> Picture | None:
 
 
 @styled
-def _histograms(traces: Sequence[Row]) -> Figure:
+def _histograms(traces: Sequence[Mapping[str, Any]]) -> Figure:
     figure, panels = panel_grid(len(traces), 3, 10 / 3, 1.9)
     for axes, trace in zip(panels, traces):
         times, interval = trace["times"], trace["times"]["frame_interval_ms"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from functools import partial
 from itertools import product
 from operator import itemgetter
@@ -20,7 +21,6 @@ from lae_sim.files import written_whole
 from lae_sim.report.study_view import (
     SETTINGS,
     View,
-    eval_scale,
     run_of,
     setting_of,
     several,
@@ -43,7 +43,7 @@ from lae_sim.report.table import (
     text_of,
     write_csv,
 )
-from lae_sim.study.summary import MEAN
+from lae_sim.study.records import MEAN, Comparison, Requirement
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
@@ -61,7 +61,7 @@ def _names(keys: Iterable[str]) -> list[Column]:
 
 
 def _exact(key: str, row: Row) -> Cell:
-    return Cell(str(row[key]), eval_scale(str(row[key])))
+    return Cell(str(row[key]), float(Fraction(row[key])))
 
 
 def _jitter(row: Row) -> Cell | None:
@@ -124,19 +124,21 @@ def ranking(
         standing_alone: whether there are only rows of the settings that stand for all.
     """
     settings = several(view.rows)
-    places = [tuple(str(row[key]) for key in ("dataset", *settings)) for row in view.rows]
+    places = [(row.dataset, *(getattr(row, key) for key in settings)) for row in view.rows]
     order = {place: i for i, place in reversed([*enumerate(places)])}
-    by_auc = sorted(zip(places, view.rows), key=lambda at: (order[at[0]], -(at[1]["auc"] or 0)))
-    rows = [row for _, row in by_auc if view.stands(row) or not standing_alone]
+    best_first = sorted(
+        zip(places, view.rows), key=lambda pair: (order[pair[0]], -(pair[1].scores["auc"] or 0))
+    )
+    shown = [row for _, row in best_first if view.stands(row) or not standing_alone]
+    rows = [{**row.flat(), "tracker": view.names[run_of(row)]} for row in shown]
     repeated = any("auc_jitter_low" in row for row in rows)
     columns = [
-        Column("tracker", lambda row: view.names[run_of(row)], is_label=True),
-        *_names(["forecaster", "dataset", *(() if standing_alone else settings)]),
+        *_names(["tracker", "forecaster", "dataset", *(() if standing_alone else settings)]),
         *(column for column in _RANKING if (titles is None or column.title in titles)
           and (repeated or column.title != "jitter")),
     ]  # fmt: skip
     first = "The best AUC first" if standing_alone else "The best AUC of each setting first"
-    return Table.of(columns, rows, "ranking", f"{first}: {shared_setting(rows)}")
+    return Table.of(columns, rows, "ranking", f"{first}: {shared_setting(shown)}")
 
 
 def table2(view: View) -> Table:
@@ -147,9 +149,9 @@ def table2(view: View) -> Table:
     without. (Rows and columns are ours; the print may order them otherwise.)
     """
     rows = view.standing
-    by_name = {(view.names[run_of(row)], row["dataset"], row["forecaster"]): row for row in rows}
+    by_name = {(view.names[run_of(row)], row.dataset, row.forecaster): row for row in rows}
     trackers = dict.fromkeys(tracker for tracker, _, _ in by_name)
-    mean = "m" if rows[0]["sigma"] == MEAN else ""
+    mean = "m" if rows[0].sigma == MEAN else ""
 
     def columns(dataset: str, metric: str, title: str) -> list[Column]:
         """A score and its change; records are a tracker and a forecaster."""
@@ -157,8 +159,8 @@ def table2(view: View) -> Table:
         def score(record: tuple[str, str]) -> float | None:
             tracker, forecaster = record
             offline = forecaster == "offline"
-            row = by_name.get((tracker, dataset, "hold" if offline else forecaster), {})
-            return row.get(f"offline_{metric}" if offline else metric)
+            row = by_name.get((tracker, dataset, "hold" if offline else forecaster))
+            return None if row is None else (row.offline if offline else row.scores).get(metric)
 
         def change(record: tuple[str, str]) -> float | None:
             tracker, forecaster = record
@@ -175,7 +177,7 @@ def table2(view: View) -> Table:
 
     scores = [
         column
-        for dataset in dict.fromkeys(row["dataset"] for row in rows)
+        for dataset in dict.fromkeys(row.dataset for row in rows)
         for metric, title in (("auc", f"{mean}AUC"), ("dp20", f"{mean}DP"))
         for column in columns(dataset, metric, title)
     ]
@@ -251,13 +253,11 @@ def comparison_table(view: View) -> Table:
     """A row per pair of traces; where there are many, of settings that stand for all."""
     rows, left_out = list(view.results.comparisons), ""
     if len(rows) > MOST_PAIRS:
-        rows = [row for row in rows if view.chosen[row["a"]] == setting_of(row)]
+        rows = [row for row in rows if view.chosen[row.a] == setting_of(row)]
         left_out = f"; {len(view.results.comparisons):,} pairs of all settings are in "
         left_out += "comparisons.csv"
     columns = [
-        *_names([*_differing(rows, ("dataset", *SETTINGS[1:])), "forecaster"]),
-        Column("a", lambda row: view.names[row["a"]], is_label=True),
-        Column("b", lambda row: view.names[row["b"]], is_label=True),
+        *_names([*_differing(rows, ("dataset", *SETTINGS)), "forecaster", "a", "b"]),
         Column("n", "sequences", _COUNT),
         Column("AUC of a - b", "difference", SIGNED),
         Column("p", "p", p_label),
@@ -265,7 +265,8 @@ def comparison_table(view: View) -> Table:
         Column("a better here", "better_here", _RATIO),
         Column("a better", "better", _RATIO),
     ]
-    table = Table.of(columns, rows, "comparisons", f"Trackers against each other{left_out}")
+    named = [{**row.flat(), "a": view.names[row.a], "b": view.names[row.b]} for row in rows]
+    table = Table.of(columns, named, "comparisons", f"Trackers against each other{left_out}")
     note = (
         "a better here: probability that one run of a beats one of b on these sequences; "
         "a better: on others like them. p: Wilcoxon's signed-rank test; Holm: corrected for the "
@@ -281,8 +282,8 @@ def required_table(view: View, mark_ends: bool = False) -> Table:
     """
     rows = view.results.required
     columns = [
-        Column("trace", run_of, is_label=True),
-        *_names([*_differing(rows, ("policy", "fps", "latency", "convention")), "forecaster"]),
+        *_names(["trace", *_differing(rows, ("policy", "fps", "latency", "convention"))]),
+        *_names(["forecaster"]),
         Column("AUC asked", "required_auc", Number(".3g")),
         Column("without latency", "auc_without_latency", SCORE),
         Column("times at most x", partial(_most, mark_ends),
@@ -294,23 +295,23 @@ def required_table(view: View, mark_ends: bool = False) -> Table:
     ]  # fmt: skip
     return Table.of(
         columns,
-        rows,
+        [{**row.flat(), "trace": run_of(row)} for row in rows],
         "required",
         "How slow a device may be, and how fast the world may move (with the recorded motion from "
-        f"frame to frame), for the required AUC at sigma {rows[0]['sigma']}",
+        f"frame to frame), for the required AUC at sigma {rows[0].sigma}",
     )
 
 
 def _most(mark_ends: bool, row: Row) -> Cell | None:
     if row["scale"] is None:
         return None
-    scale = eval_scale(row["scale"])
+    scale = float(Fraction(row["scale"]))
     return Cell(">= " * (mark_ends and not row["beyond"]) + f"{scale:.2f}", scale)
 
 
-def _differing(rows: Iterable[Row], keys: Iterable[str]) -> list[str]:
+def _differing(rows: Sequence[Comparison | Requirement], keys: Iterable[str]) -> list[str]:
     """The keys whose values differ between rows."""
-    return [key for key in keys if len({row[key] for row in rows}) > 1]
+    return [key for key in keys if len({getattr(row, key) for row in rows}) > 1]
 
 
 def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -> None:
@@ -350,7 +351,7 @@ def study_text(results: StudyResults | View) -> str:
     """The tables for a terminal, then what they rest on."""
     view = results if isinstance(results, View) else View(results)
     results, tables = view.results, [ranking(view, _TERMINAL)]
-    repeated = any(row["repetitions"] > 1 for row in view.rows)
+    repeated = any(row.repetitions > 1 for row in view.rows)
     if results.comparisons and (repeated or len(results.comparisons) <= 30):
         tables.append(comparison_table(view))
     if results.required:
@@ -361,11 +362,11 @@ def study_text(results: StudyResults | View) -> str:
         text = text.replace("★", "*")  # not every terminal has stars
         parts.append("\n".join([table.caption, text, legend_of(table)]))
     lines = [f"{len(results.plan.cells)} cells, {results.computed} of them computed now"]
-    approximate = [row["approximate_share"] for row in view.rows if not row["exact"]]
+    approximate = [row.approximate_share for row in view.rows if not row.exact]
     if approximate:
         lines.append(
             f"approximate: up to {100 * max(approximate):.3g}% of the outputs of a replay follow "
             "another frame than when recorded"
         )
-    lines += [f"not computed: {each['of']}: {each['reason']}" for each in results.failures]
+    lines += [f"not computed: {each.of}: {each.reason}" for each in results.failures]
     return "\n\n".join([*parts, "\n".join([*lines, *results.notes()])])

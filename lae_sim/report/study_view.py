@@ -5,8 +5,9 @@ One setting of each trace stands for all: the first that the study names, at sca
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,8 @@ import numpy as np
 from lae_sim.comparison.statistics import by_attribute
 from lae_sim.errors import LaeError
 from lae_sim.report.table import printable
-from lae_sim.study.summary import MEAN, Row, Scores
+from lae_sim.study.records import MEAN, Comparison, Requirement, SummaryRow
+from lae_sim.study.summary import Scores
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -23,15 +25,18 @@ if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
 
 
-def run_of(row: Mapping[str, Any]) -> str:
-    """The trace of a row of the summary, and where its times come from, if from another."""
-    trace, times = str(row["trace"]), row["times_from"]
-    return trace if times == trace else f"{trace} at {times}"
+SETTINGS = ("policy", "fps", "latency", "scale", "convention")
+"""What says how a trace is replayed and scored, but for where its times come from."""
 
 
-def setting_of(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """The setting of a row of the summary, but for where its times come from."""
-    return tuple(str(row[name]) for name in SETTINGS[1:])
+def run_of(row: SummaryRow | Requirement) -> str:
+    """The trace of a row, and where its times come from, if from another."""
+    return row.trace if row.times_from == row.trace else f"{row.trace} at {row.times_from}"
+
+
+def setting_of(row: SummaryRow | Comparison) -> tuple[str | Fraction, ...]:
+    """The values of `SETTINGS` in a row."""
+    return tuple(getattr(row, name) for name in SETTINGS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,33 +50,54 @@ class View:
     results: StudyResults
 
     @cached_property
-    def rows(self) -> list[Row]:
-        """Rows with intervals (see :func:`lae_sim.report.study_view.primary`)."""
-        return primary(self.results.summary)
+    def rows(self) -> list[SummaryRow]:
+        """The rows that have intervals: of the first sigma, or of the mean over the grid of them.
+
+        The latter say how stale answers are at the first sigma.
+        """
+        last = {(run_of(r), setting_of(r), r.forecaster): r for r in self.results.summary}
+        if not any(row.sigma == MEAN for row in last.values()):
+            return list(self._first.values())
+        pairs = zip(last.values(), self._first.values())
+        return [replace(row, staleness=first.staleness) for row, first in pairs]
 
     @cached_property
-    def chosen(self) -> dict[str, tuple[str, ...]]:
+    def _first(self) -> dict[tuple[Any, ...], SummaryRow]:
+        """The rows of the first sigma, by run, setting and forecaster."""
+        rows: dict[tuple[Any, ...], SummaryRow] = {}
+        for row in self.results.summary:
+            rows.setdefault((run_of(row), setting_of(row), row.forecaster), row)
+        return rows
+
+    def row_of(self, scores: Scores) -> SummaryRow:
+        """The row of the summary that has the means of scores at the first sigma."""
+        setting = scores.setting
+        values = setting.policy, setting.fps, setting.latency, setting.world.scale
+        return self._first[setting.run, (*values, scores.convention), scores.forecaster]
+
+    @cached_property
+    def chosen(self) -> dict[str, tuple[str | Fraction, ...]]:
         """The setting that stands for all, of each run."""
-        found: dict[str, tuple[str, ...]] = {}
+        chosen: dict[str, SummaryRow] = {}
         for row in self.rows:
-            first = found.setdefault(run_of(row), setting_of(row))
-            if row["scale"] == "1" and first[SETTINGS.index("scale") - 1] != "1":
-                found[run_of(row)] = setting_of(row)
-        return found
+            first = chosen.setdefault(run_of(row), row)
+            if row.scale == 1 and first.scale != 1:
+                chosen[run_of(row)] = row
+        return {run: setting_of(row) for run, row in chosen.items()}
 
     @cached_property
-    def standing(self) -> list[Row]:
+    def standing(self) -> list[SummaryRow]:
         """The rows of the settings that stand for all."""
         return [row for row in self.rows if self.stands(row)]
 
-    def stands(self, row: Mapping[str, Any]) -> bool:
+    def stands(self, row: SummaryRow) -> bool:
         """Whether a row's setting stands for all."""
         return self.chosen[run_of(row)] == setting_of(row)
 
     @cached_property
     def names(self) -> dict[str, str]:
         """Names of the runs: their trackers, where these tell the runs of each dataset apart."""
-        runs = {run_of(row): (row["dataset"], row["tracker"]) for row in self.rows}
+        runs = {run_of(row): (row.dataset, row.tracker) for row in self.rows}
         alone = len({*runs.values()}) == len(runs)
         alone &= all(tracker != "unknown" for _, tracker in runs.values())
         return {run: printable(tracker if alone else run) for run, (_, tracker) in runs.items()}
@@ -79,7 +105,7 @@ class View:
     @cached_property
     def forecasters(self) -> tuple[str, ...]:
         """Names, hold first."""
-        return tuple(dict.fromkeys(["hold", *(row["forecaster"] for row in self.rows)]))
+        return tuple(dict.fromkeys(["hold", *(row.forecaster for row in self.rows)]))
 
     @cached_property
     def attributes(self) -> DataFrame | None:
@@ -91,97 +117,67 @@ class View:
         import pandas as pd
 
         study, parts = self.results.plan.study, []
-        chosen = [s for s in self.results.scores if study.attributes and self.stands(row_of(s))]
-        for dataset in dict.fromkeys(scores.source.metadata.dataset for scores in chosen):
-            ours = [scores for scores in chosen if scores.source.metadata.dataset == dataset]
+        scored = self.results.scores if study.attributes else ()
+        groups: dict[str, list[Scores]] = {}
+        for scores in scored:
+            if self.stands(self.row_of(scores)):
+                groups.setdefault(scores.source.metadata.dataset, []).append(scores)
+        for dataset, group in groups.items():
             attributes = {
                 (dataset, sequence): tuple(map(printable, s.source.metadata.attributes(sequence)))
-                for s in ours
+                for s in group
                 for sequence in s.sequences
             }
             if any(attributes.values()):
-                rows = [row for scores in ours for row in self._tidy(scores)]
-                settings: dict[str, Any] = {"baselines": ("hold",), "metrics": ("auc",)}
+                table = pd.DataFrame([row for scores in group for row in self._tidy(scores)])
                 try:
                     found = by_attribute(
-                        pd.DataFrame(rows), attributes, **settings, seed=study.seed
+                        table, attributes, baselines=("hold",), metrics=("auc",), seed=study.seed
                     )
                 except LaeError:
                     continue  # no sequence has a score of every forecaster
                 parts.append(found.assign(dataset=printable(dataset)))
         return pd.concat(parts, ignore_index=True) if parts else None
 
-    def _tidy(self, scores: Scores) -> Iterable[Row]:
+    def _tidy(self, scores: Scores) -> Iterable[dict[str, str | float]]:
         """The AUC of each sequence, as :mod:`lae_sim.comparison.statistics` wants it."""
-        row = row_of(scores)
-        row |= {"trace": self.names[run_of(row)], "scale": eval_scale(row["scale"])}
-        values = {row["forecaster"]: scores.means["auc"][:, 0]}
-        if row["forecaster"] == "hold":
-            values["offline"] = scores.once["offline_auc"]
-        for forecaster, aucs in values.items():
-            row |= {"forecaster": forecaster, "sigma": 0.0, "metric": "auc"}
-            for s in np.flatnonzero(~np.isnan(aucs)).tolist():
-                yield {**row, "sequence": scores.sequences[s], "value": float(aucs[s])}
+        row = self.row_of(scores)
+        aucs = {row.forecaster: scores.means["auc"][:, 0]}
+        if row.forecaster == "hold":
+            aucs["offline"] = scores.once["offline_auc"]
+        for forecaster, values in aucs.items():
+            for s in np.flatnonzero(~np.isnan(values)).tolist():
+                yield {
+                    "trace": self.names[run_of(row)],
+                    "dataset": row.dataset,
+                    "latency": row.latency,
+                    "scale": float(row.scale),
+                    "sigma": 0.0,
+                    "forecaster": forecaster,
+                    "metric": "auc",
+                    "sequence": scores.sequences[s],
+                    "value": float(values[s]),
+                }
 
 
-def row_of(scores: Scores) -> dict[str, Any]:
-    """What says which scores these are, as the rows of the summary say it."""
-    return {
-        **scores.setting.columns(),
-        "dataset": scores.source.metadata.dataset,
-        "convention": scores.convention,
-        "forecaster": scores.forecaster,
-        "sigma": str(scores.setting.world.sigmas[0]),
-    }
-
-
-def shared_setting(rows: Sequence[Mapping[str, Any]], but: str = "") -> str:
+def shared_setting(rows: Sequence[SummaryRow], but: str = "") -> str:
     """What some rows have in common, in words; one key may be left out."""
     parts = []
     labels = ("policy", "world", "latency", "times x", "convention")
-    for name, label in zip(SETTINGS[1:], labels):
-        values = {str(row[name]) for row in rows}
+    for name, label in zip(SETTINGS, labels):
+        values = {str(getattr(row, name)) for row in rows}
         value = (
             values.pop() if len(values) == 1 else "of each trace" if name == "fps" else "various"
         )
         unit = " fps" if name == "fps" and value[0].isdigit() else ""
         parts += [f"{label} {value}{unit}"] if name != but else []
-    sigma = rows[0]["sigma"]
-    told = "mean over sigma = 0, 0.02, ..., 1" if sigma == MEAN else f"sigma {sigma}"
-    return ", ".join(parts if but == "sigma" else [*parts, told])
+    sigma = rows[0].sigma
+    text = "mean over sigma = 0, 0.02, ..., 1" if sigma == MEAN else f"sigma {sigma}"
+    return ", ".join(parts if but == "sigma" else [*parts, text])
 
 
-SETTINGS = ("times_from", "policy", "fps", "latency", "scale", "convention")
-
-
-def primary(rows: Sequence[Row]) -> list[Row]:
-    """The rows that have intervals: those of the first sigma, or of the mean over the grid of them.
-
-    The latter say how stale answers are at the first sigma.
-    """
-    keys = ("trace", "forecaster", *SETTINGS)
-    first: dict[tuple[Any, ...], Row] = {}
-    last: dict[tuple[Any, ...], Row] = {}
-    for row in rows:
-        key = tuple(row[name] for name in keys)
-        first.setdefault(key, row)
-        last[key] = row
-    grid = any(row["sigma"] == MEAN for row in rows)
-    return [{**first[key], **last[key]} if grid else first[key] for key in first]
-
-
-def several(rows: Sequence[Row]) -> list[str]:
+def several(rows: Sequence[SummaryRow]) -> list[str]:
     """Settings that differ between rows."""
-    own = {"times_from": "trace"}
-    return [
-        name
-        for name in SETTINGS
-        if any(row[name] != (row[own[name]] if name in own else rows[0][name]) for row in rows)
-    ]
-
-
-def eval_scale(text: str) -> float:
-    """A scale such as ``"137/100"`` as a number."""
-    from fractions import Fraction
-
-    return float(Fraction(text))
+    elsewhere = any(row.times_from != row.trace for row in rows)
+    differ = [name for name in SETTINGS if len({getattr(row, name) for row in rows}) > 1]
+    return ["times_from"] * elsewhere + differ

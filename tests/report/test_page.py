@@ -19,6 +19,7 @@ from lae_sim.evaluation.metrics import CONVENTIONS
 from lae_sim.report import study_figures
 from lae_sim.report.page import convention_in_words, page, page_file, write_report
 from lae_sim.report.study_view import View
+from lae_sim.study.records import Failure
 from lae_sim.study.run import compute_study
 from lae_sim.study.spec import Study
 
@@ -63,7 +64,7 @@ def results(tmp_path_factory):
         require_auc=Fraction(1, 2),
     )
     found = compute_study(study, folder / "results", workers=1)
-    failure = {"of": f"three {NASTY}", "reason": NASTY}
+    failure = Failure(f"three {NASTY}", NASTY)
     return dataclasses.replace(found, failures=(failure,))
 
 
