@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 
@@ -31,3 +32,15 @@ def described(error: BaseException) -> str:
     last = traceback.extract_tb(error.__traceback__)[-1]
     message = " ".join(str(error).split())[:300]
     return f"{type(error).__name__}: {message} ({last.filename}, line {last.lineno})"
+
+
+def shown(value: object) -> str:
+    """A value in one line of at most 60 characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def hint(name: object, known: Iterable[str]) -> str:
+    """What was perhaps meant by a name that is not known, to end a message with."""
+    close = difflib.get_close_matches(name, list(known), 1) if isinstance(name, str) else []
+    return f"; did you mean {close[0]!r}?" if close else ""

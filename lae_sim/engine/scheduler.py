@@ -17,7 +17,7 @@ import numpy as np
 
 from lae_sim._arrays import Ints
 from lae_sim.engine.clock import Clock
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
 
 if TYPE_CHECKING:
     import simpy
@@ -79,9 +79,18 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
         LaeError: if the sequence is empty, a time is negative, a policy goes back in time, or an
             instant does not fit in 64-bit ticks.
         TypeError: if a time is not an integer, such as seconds as a float.
+
+    Example:
+        >>> import lae_sim
+        >>> from lae_sim.engine import Clock, latest
+        >>> schedule = lae_sim.simulate(9, Clock.at(30), lambda frame: 47_000_000, latest)
+        >>> schedule.frames.tolist()
+        XX
     """
     import simpy
 
+    if not isinstance(clock, Clock):
+        raise LaeError(f"clock: such as Clock.at(30), not {shown(clock)}")
     if length < 1:
         raise LaeError("a sequence needs at least one frame")
     calls: list[Call] = []

@@ -17,7 +17,7 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import centre, iou
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, hint, shown
 
 CENTRE_THRESHOLDS = np.arange(51, dtype=np.float64)
 NORM_THRESHOLDS = np.arange(51) / 100
@@ -91,8 +91,9 @@ def find_convention(name: str) -> Convention:
     Raises:
         LaeError: if there is none of that name.
     """
-    if name not in CONVENTIONS:
-        raise LaeError(f"no convention {name!r}: there are {', '.join(CONVENTIONS)}")
+    if not isinstance(name, str) or name not in CONVENTIONS:
+        known = ", ".join(CONVENTIONS) + hint(name, CONVENTIONS)
+        raise LaeError(f"no convention {shown(name)}: there are {known}")
     return CONVENTIONS[name]
 
 

@@ -8,7 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, hint, shown
 from lae_sim.plugins import bound, imported, key_and_value, parse_options
 
 if TYPE_CHECKING:
@@ -74,6 +74,8 @@ def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:
     Raises:
         LaeError: as :func:`load_forecaster`.
     """
+    if not isinstance(name, str):
+        raise LaeError(f"a forecaster is named by text, such as 'kalman', not {shown(name)}")
     what = f"forecaster {name!r}"
     if name.startswith("camera+"):
         return _over_camera(name, camera)
@@ -90,7 +92,8 @@ def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:
         return _built_in(what, kind, value)
     if not colon:
         names = ", ".join([*BUILT_IN, "kalman:q=...", "learned:FILE.pt", "camera+NAME"])
-        raise LaeError(f"no {what}: there are {names}, and package.module:factory")
+        known = hint(name, (*BUILT_IN, "tuned-kalman", "learned"))
+        raise LaeError(f"no {what}: there are {names}, and package.module:factory{known}")
     factory: AnyFactory | Trainer = imported(what, name)
     if isinstance(factory, type) and hasattr(factory, "fit"):
         factory = bound(what, factory, [], {})

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from lae_sim.engine.clock import parse_fps, parse_rational
+from lae_sim.engine.clock import Number, exact, parse_fps, parse_rational
 from lae_sim.errors import LaeError, TraceError
 
 FORMAT = "lae-trace"
@@ -35,11 +35,11 @@ class Metadata:
     document: Mapping[str, Any]
 
     @classmethod
-    def new(cls, fps: str, kind: str, **more: Any) -> Metadata:
+    def new(cls, fps: Number, kind: str, **more: Any) -> Metadata:
         """Metadata with the required keys, and any of the optional ones by name.
 
         Args:
-            fps: the frame rate as exact text, such as ``"30000/1001"``.
+            fps: the frame rate, such as ``30`` or ``"30000/1001"``; text is kept as it is.
             kind: ``"every-frame"`` or ``"real-time"``.
             more: optional keys: ``tracker``, ``device``, ``timing``, ``dataset``, ``sequences``;
                 ``schedule`` adds to the schedule object.
@@ -47,6 +47,7 @@ class Metadata:
         Raises:
             TraceError: if a value does not fit the format.
         """
+        fps = fps if isinstance(fps, str) else str(exact(fps))
         schedule = {"kind": kind, **more.pop("schedule", {})}
         document = {"format": FORMAT, "version": VERSION, "fps": fps, "schedule": schedule, **more}
         return cls.of(document)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.engine.scheduler import Schedule
+from lae_sim.errors import LaeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,20 +48,26 @@ class Recording:
         """A recording from anything array-like (not copied); ``score`` defaults to none.
 
         Raises:
-            ValueError: if the lengths differ.
+            LaeError: if the lengths differ, or something is not made of numbers.
         """
-        times = np.asarray(elapsed_ns, np.int64)
-        no_score = np.full(len(times), np.nan, np.float32)
-        recording = cls(
-            name,
-            np.asarray(truth, np.float64).reshape(-1, 4),
-            np.asarray(boxes, np.float64).reshape(-1, 4),
-            times,
-            no_score if score is None else np.asarray(score, np.float32),
-        )
+        try:
+            with np.errstate(invalid="ignore"):
+                times = np.asarray(elapsed_ns, np.int64)
+            if not np.array_equal(times, elapsed_ns):
+                raise LaeError(f"{name}: elapsed_ns: times are whole nanoseconds")
+            no_score = np.full(len(times), np.nan, np.float32)
+            recording = cls(
+                name,
+                np.asarray(truth, np.float64).reshape(-1, 4),
+                np.asarray(boxes, np.float64).reshape(-1, 4),
+                times,
+                no_score if score is None else np.asarray(score, np.float32),
+            )
+        except (TypeError, ValueError) as error:
+            raise LaeError(f"{name}: not boxes [T, 4] and times in ns [T]: {error}") from error
         lengths = {len(recording.truth), len(recording.boxes), len(times), len(recording.score)}
         if len(lengths) != 1:
-            raise ValueError(f"{name}: truth, boxes, times and scores differ in length: {lengths}")
+            raise LaeError(f"{name}: truth, boxes, times and scores differ in length: {lengths}")
         return recording
 
     @classmethod
