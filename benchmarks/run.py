@@ -21,7 +21,9 @@ import numpy as np
 import simpy
 from filterpy.kalman import KalmanFilter
 
-from lae_sim import Clock, Metadata, Recording, Trace, latest, simulate, write_trace
+from lae_sim import Metadata, Recording, Trace, simulate, write_trace
+from lae_sim.engine.clock import Clock
+from lae_sim.engine.policies import latest
 from lae_sim.forecast.base import ForecasterFactory, Lanes, defines, forecast
 from lae_sim.learning.folds import Examples
 from lae_sim.learning.registry import load_forecaster
@@ -44,7 +46,7 @@ for _ in pq.ParquetFile(sys.argv[1], pre_buffer=False).iter_batches(65536, use_t
 """
 REPLAY = """
 import contextlib, io, sys
-from lae_sim.replay import main
+from lae_sim.cli.replay import main
 with contextlib.redirect_stdout(io.StringIO()):
     assert main([*sys.argv[1:], "--json"]) == 0
 """
