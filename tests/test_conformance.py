@@ -12,7 +12,7 @@ import pytest
 from places import SHARED
 
 from lae_sim.engine.clock import Clock, parse_fps
-from lae_sim.evaluation.evaluate import answers, evaluate
+from lae_sim.evaluation.evaluate import answers, evaluate_runs
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.run import Run, replay_sequence
@@ -77,7 +77,7 @@ def test_metrics(case: dict[str, Any], run: Run, metadata: Metadata) -> None:
     assert set(forecasters) == {"hold", "kalman"}
     assert set(conventions) == {"pysot", "exclude"}
     for convention in conventions:
-        found = evaluate([run], metadata, forecasters, sigmas, find_convention(convention))
+        found = evaluate_runs([run], metadata, forecasters, sigmas, find_convention(convention))
         for f, forecaster in enumerate(forecasters):
             for m, sigma in enumerate(sigmas):
                 for metric, value in metrics[names[sigma]][forecaster][convention].items():

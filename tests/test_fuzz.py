@@ -21,7 +21,7 @@ from witness import BOX, MINIMAL, TRUTH, TYPES, columns_of, moving, same, write_
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import fifo, latest, shrinking_tail, vot_realtime
 from lae_sim.errors import LaeError, TraceError
-from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.forecast.base import Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
 from lae_sim.replay.latency import by_call, by_frame, constant, lognormal, resampled
@@ -57,7 +57,7 @@ def use(path: Path) -> Found | None:
                 with suppress(LaeError):
                     run = replay_sequence(recording, clock, source, policy)
                     if source is by_frame and policy is latest:
-                        evaluate([run], trace.metadata, FORECASTERS, SIGMA_GRID[::10])
+                        evaluate_runs([run], trace.metadata, FORECASTERS, SIGMA_GRID[::10])
     return trace.metadata, recordings
 
 
@@ -468,4 +468,4 @@ def test_any_time_at_any_rate_is_replayed_or_refused(elapsed: int, fps: str) -> 
     for policy in (latest, fifo, shrinking_tail(ns=elapsed), vot_realtime()):
         with suppress(LaeError):
             run = replay_sequence(recording, Clock.at(Fraction(fps)), policy=policy)
-            evaluate([scored_at_arrival(run)], metadata, {"k": Kalman}, SIGMA_GRID)
+            evaluate_runs([scored_at_arrival(run)], metadata, {"k": Kalman}, SIGMA_GRID)

@@ -108,12 +108,12 @@ assert len(list(read_trace(sys.argv[1]))[0]) == 9
 
 EVALUATE = """
 from lae_sim.engine.clock import Clock
-from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.run import replay_sequence
 trace = read_trace(sys.argv[1])
 runs = [replay_sequence(r, Clock.at(trace.metadata.fps)) for r in trace]
-evaluate(runs, trace.metadata, {"kalman": load_forecaster("kalman")})
+evaluate_runs(runs, trace.metadata, {"kalman": load_forecaster("kalman")})
 """
 
 HEAVY = {"pandas", "torch", "cv2", "matplotlib", "scipy", "filterpy", "IPython"}

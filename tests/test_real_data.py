@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from lae_sim.engine.clock import Clock
-from lae_sim.evaluation.evaluate import Evaluation, evaluate
+from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import by_frame, constant, scaled
 from lae_sim.replay.run import replay_sequence
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.study.run import run_study
+from lae_sim.study.run import compute_study
 from lae_sim.study.spec import Study
 from lae_sim.trace.file import Trace, read_trace, write_trace
 from lae_sim.trace.metadata import Metadata
@@ -82,7 +82,7 @@ def test_ortrack_on_visdrone(
 ) -> None:
     source = scaled(by_frame, Fraction(factor))
     runs = [replay_sequence(recording, CLOCK, source) for recording in ortrack]
-    found = evaluate(runs, METADATA, FORECASTERS)
+    found = evaluate_runs(runs, METADATA, FORECASTERS)
     assert len(found.replay.sequences) == 20
     assert found.replay.frames.sum() == 19_433
     assert found.replay.processed.sum() == processed
@@ -94,7 +94,7 @@ def test_ortrack_on_visdrone(
 
 def test_nanotrack_on_dtb70_at_47_ms(nanotrack: Trace) -> None:
     runs = [replay_sequence(recording, CLOCK) for recording in nanotrack]
-    found = evaluate(runs, METADATA, FORECASTERS)
+    found = evaluate_runs(runs, METADATA, FORECASTERS)
     assert len(found.replay.sequences) == 70
     assert found.replay.processed.sum() == 11_226
     assert found.staleness.mismatch_sum.sum() == 40_315
@@ -106,7 +106,7 @@ def test_nanotrack_on_dtb70_at_47_ms(nanotrack: Trace) -> None:
 def test_nanotrack_over_the_grid_of_permitted_latencies(nanotrack: Trace) -> None:
     source = constant(ns=47_000_000)
     runs = [replay_sequence(recording, CLOCK, source) for recording in nanotrack]
-    found = evaluate(runs, METADATA, FORECASTERS, SIGMA_GRID)
+    found = evaluate_runs(runs, METADATA, FORECASTERS, SIGMA_GRID)
     assert means(found) == {"hold": (0.4560, 0.6086), "kalman": (0.5485, 0.7475)}
 
 
@@ -119,8 +119,8 @@ def test_studies_reach_the_same_figures_in_batches(
     scales = (Fraction(1), Fraction(2), Fraction(4))
     slower = Study((str(tmp_path / "ortrack.parquet"),), scales=scales)
     rows = [
-        *run_study(nano, tmp_path / "a", workers=1).summary,
-        *run_study(slower, tmp_path / "b", workers=1).summary,
+        *compute_study(nano, tmp_path / "a", workers=1).summary,
+        *compute_study(slower, tmp_path / "b", workers=1).summary,
     ]
     assert {row["engine"] for row in rows} == {"batch"}
     found = {
@@ -140,6 +140,6 @@ def test_studies_reach_the_same_figures_in_batches(
 
 def test_offline_values_do_not_depend_on_latency(nanotrack: Trace) -> None:
     runs = [replay_sequence(r, CLOCK, constant(ns=0)) for r in list(nanotrack)[:5]]
-    found = evaluate(runs, METADATA, FORECASTERS)
+    found = evaluate_runs(runs, METADATA, FORECASTERS)
     for metric, offline in found.offline.items():
         assert found.scores[metric][0, :, 0].tolist() == offline.tolist()

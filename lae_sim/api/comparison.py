@@ -152,12 +152,8 @@ def compare_forecasters(
 
     Example:
         >>> import lae_sim
-        >>> found = lae_sim.compare_forecasters(
-        ...     "traces/synthetic-slow.parquet", forecasters="kalman", latency="constant:47ms"
-        ... )
-        >>> found
-        <ComparisonResult of synthetic-slow.parquet, constant:47ms: AUC hold 0.5791, kalman 0.6414, \
-offline 0.7773>
+        >>> lae_sim.compare_forecasters("traces/synthetic-slow.parquet", forecasters="kalman")
+        <ComparisonResult of synthetic-slow.parquet, recorded: AUC hold 0.5722, kalman 0.6291, ...>
     """
     opened = labelled_traces(traces, sequences)
     names, objects = forecaster_names(forecasters)

@@ -89,12 +89,11 @@ def _render(arguments: argparse.Namespace) -> None:
             f"{arguments.trace} has {len(runs)} sequences: choose one with --sequence, or give a "
             "folder as --out"
         )
-    found = {run.recording.name: _images(run, metadata, arguments) for run in runs}
-    camera = Camera(found, runs[0].schedule.clock.fps)
+    sequences = {run.recording.name: _images(run, metadata, arguments) for run in runs}
+    camera = Camera(sequences, runs[0].schedule.clock.fps)
     forecasters = {name: load_forecaster(name, camera) for name in arguments.forecaster}
     for run in runs:
-        images = found[run.recording.name]
-        scene = Scene.of(run, images, metadata, forecasters)
+        scene = Scene.of(run, sequences[run.recording.name], metadata, forecasters)
         if folder:
             out.mkdir(parents=True, exist_ok=True)
             name = run.recording.name.replace("/", "-")

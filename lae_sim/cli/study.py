@@ -6,16 +6,13 @@ import argparse
 import signal
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser
 from lae_sim.engine.clock import whole
-from lae_sim.errors import LaeError
 
 if TYPE_CHECKING:
-    from lae_sim.study.run import StudyResults
-    from lae_sim.study.spec import Study
+    pass
 
 PROGRAM = "lae-sim study"
 
@@ -79,25 +76,15 @@ def _study(arguments: argparse.Namespace) -> bool:
     """Run the study; whether a part of it failed."""
     import json
 
-    from lae_sim.study.spec import read_study
+    from lae_sim.api.study import run_study
 
-    study = read_study(arguments.study)
-    path = Path(arguments.study)
-    folder = arguments.out or f"{path.stem}-results"
-    if arguments.workers and arguments.scheduler:
-        raise LaeError("--scheduler says where to compute: --workers is for this machine")
-    results = _run(arguments, study, folder, path.parent)
-    if not arguments.no_report:
-        from lae_sim.report.page import write_report
-        from lae_sim.report.study_tables import write_tables
-        from lae_sim.report.study_view import View
-
-        view = View(results)
-        write_tables(view, results.folder / "tables")
-        write_report(view, results.folder / "report.html")
-    else:
-        for path in [results.folder / "report.html", *(results.folder / "tables").glob("*.*")]:
-            path.unlink(missing_ok=True)  # it would be of other results
+    results = run_study(
+        arguments.study,
+        arguments.out,
+        workers=arguments.workers,
+        scheduler=arguments.scheduler,
+        report=not arguments.no_report,
+    )
     if arguments.json:
         print(json.dumps(results.document(), indent=2, allow_nan=False))
     else:
@@ -107,18 +94,3 @@ def _study(arguments: argparse.Namespace) -> bool:
         left = sorted(path.name for path in results.folder.glob("[!.]*"))
         print(f"{results.folder}: {', '.join(left)}")
     return bool(results.failures)
-
-
-def _run(arguments: argparse.Namespace, study: Study, folder: str, base: Path) -> StudyResults:
-    """Run with a progress bar, if the standard error stream is a terminal."""
-    from tqdm import tqdm
-
-    from lae_sim.study.run import run_study
-
-    with tqdm(unit=" tasks", disable=None) as bar:
-
-        def progress(what: str, done: int, total: int) -> None:
-            bar.total, bar.n = total, done
-            bar.set_description(what)
-
-        return run_study(study, folder, base, arguments.workers, arguments.scheduler, progress)

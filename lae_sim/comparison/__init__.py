@@ -1,1 +1,5 @@
 """Comparing forecasters and replays: intervals, paired tests, distances to closed loops."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

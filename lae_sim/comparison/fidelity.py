@@ -12,7 +12,7 @@ from lae_sim._arrays import Floats
 from lae_sim.boxes import PARTED_IOU, iou
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.evaluation.metrics import Convention, find_convention
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import load_forecaster
@@ -147,7 +147,7 @@ def _rows(
 
     def scores(runs: list[Run]) -> Mapping[str, Floats]:
         sigmas = (Fraction(0),)
-        return evaluate(runs, closed.metadata, forecasters, sigmas, convention).scores
+        return evaluate_runs(runs, closed.metadata, forecasters, sigmas, convention).scores
 
     clock = Clock.at(closed.metadata.fps)
     closed_runs = list(Runs(closed, clock, policy=policy))

@@ -11,7 +11,7 @@ import numpy as np
 
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.caveats import notes_on
-from lae_sim.evaluation.evaluate import Evaluation, evaluate
+from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
 from lae_sim.evaluation.metrics import METRICS, find_convention
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import cost_notes, resolve_costs
@@ -74,7 +74,7 @@ def score_forecasters(
             runs = list(world.replay(trace))
             progress(f"{label}, {world.label()}")
             costs = resolve_costs(world.costs, ready, [runs[0].recording])
-            evaluation = evaluate(runs, trace.metadata, ready, sigmas, convention, costs=costs)
+            evaluation = evaluate_runs(runs, trace.metadata, ready, sigmas, convention, costs=costs)
             rows = _rows(evaluation, list(ready), sigmas)
             setting = {"latency": label_of(world.latency), "scale": float(world.scale)}
             tables.append(rows.assign(trace=label, dataset=dataset, **setting))

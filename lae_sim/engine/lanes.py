@@ -49,14 +49,14 @@ def simulate_lanes(
     Raises:
         LaeError: what ``simulate`` raises, when that sequence's turn comes.
     """
-    found: list[Schedule | None] = [None] * len(lengths)
+    schedules: list[Schedule | None] = [None] * len(lengths)
     if len(lengths) >= _FEWEST and min(lengths) > 0 and batchable(services, policy):
         times, rule = cast("Sequence[Times]", services), cast(LanePolicy, policy)
         for lanes in _chunks(lengths):
             sizes = np.array([lengths[i] for i in lanes])
             for i, schedule in zip(lanes, _together(sizes, clock, [times[i] for i in lanes], rule)):
-                found[i] = schedule
-    for length, service, schedule in zip(lengths, services, found):
+                schedules[i] = schedule
+    for length, service, schedule in zip(lengths, services, schedules):
         yield schedule or simulate(length, clock, service, policy)
 
 
@@ -74,7 +74,24 @@ def _chunks(lengths: Sequence[int]) -> Iterator[list[int]]:
 def _together(
     lengths: Ints, clock: Clock, times: Sequence[Times], policy: LanePolicy
 ) -> list[Schedule | None]:
-    """The schedules of lanes, shortest first; None for those that the SimPy engine is to have."""
+    """The schedules of lanes, shortest first; None for those that the SimPy engine is to have.
+
+    ``_STEPS`` calls of all lanes are worked out in ``rows``, of which ``frames``, ``starts`` and
+    ``ready`` are views, and so is what the loop writes: row ``j + 1`` of frames and starts is the
+    call after the one in row ``j``, so that the last row begins the next round::
+
+        rows[0] = frames      rows[1] = starts      rows[2] = ready
+                lane 0  1  2
+        row 0      f  f  f       s  s  s               e  e  e     call k      e = s + time
+        row 1      F  F  F       S  S  S               .  .  .     call k + 1  F = policy(f, e)
+        ...                                                                    S = max(e, F's tick)
+        row STEPS  F  F  F       S  S  S               (unused)    copied to row 0
+
+    The rows of a round are then moved to ``done[:, lane, k : k + _STEPS]``, where the calls of one
+    lane stand together. Lanes that have ended are cut off at the front, since the shortest come
+    first; those among the rest work on, and what they write after their last call is left out by
+    ``calls``.
+    """
     interval, width = clock.frame_ticks, len(lengths)
     taken = np.empty((width, int(lengths[-1]) + _STEPS), np.int64)
     for space, lane in zip(taken, times):
@@ -87,7 +104,6 @@ def _together(
     by_call = np.array([lane.by_call for lane in times])
     all_by_call = bool(by_call.all())
     ends = lengths * interval
-    # one row for each call of all lanes, and the next call's beginning; then moved to lane by lane
     frames, starts, ready = rows = np.empty((3, _STEPS + 1, width), np.int64)
     frames[0] = starts[0] = 0
     done = np.empty((3, *taken.shape), np.int64)

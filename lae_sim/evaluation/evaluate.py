@@ -188,7 +188,7 @@ Observer: TypeAlias = "Callable[[ScoredRun], object]"
 """``observer(scored)`` takes a run that is being scored, each in its turn."""
 
 
-def evaluate(
+def evaluate_runs(
     runs: Iterable[Run],
     metadata: Metadata,
     forecasters: Mapping[str, AnyFactory],
@@ -228,7 +228,7 @@ def evaluate_groups(
     """The same, group after group of sequences, for those who keep less than all of it.
 
     Args:
-        runs, metadata, forecasters, sigmas, convention, costs: see :func:`evaluate`.
+        runs, metadata, forecasters, sigmas, convention, costs: see :func:`evaluate_runs`.
         frames: about how many world frames are scored at once: the more, the faster, and the more
             memory.
         curves_at: the sigma of the success and precision curves; the first by default.
@@ -236,7 +236,7 @@ def evaluate_groups(
         observed: the answers that they look at, by forecaster and sigma.
 
     Raises:
-        LaeError: as :func:`evaluate`.
+        LaeError: as :func:`evaluate_runs`.
     """
     if not forecasters:
         raise LaeError("name at least one forecaster, such as hold")
@@ -453,15 +453,15 @@ def _answers(
             else [factory] * len(runs)
         )
     for fed in histories(pairing, memoryless=defines(factory, "memoryless")).parts(_PART):
-        found = pairs(pairing, fed)
+        paired = pairs(pairing, fed)
         lanes = lanes_of(runs, pairing, fed, image_sizes)
-        shared = {id(its): its for its in factories}.values()
-        if len(shared) == 1:
-            yield fed, found, forecast(factories[0], lanes, found.item, found.frame, name)
+        distinct = {id(one): one for one in factories}.values()
+        if len(distinct) == 1:
+            yield fed, paired, forecast(factories[0], lanes, paired.item, paired.frame, name)
             continue
-        answered = np.empty((len(found.item), 4))
-        for each in shared:  # at once where several share one
-            theirs = np.array([its is each for its in factories])[fed.sequence]
-            part, asked, item = lanes.chosen(theirs, found.item)
-            answered[asked] = forecast(each, part, item, found.frame[asked], name)
-        yield fed, found, answered
+        answered = np.empty((len(paired.item), 4))
+        for one in distinct:  # at once where several sequences share one
+            chosen = np.array([other is one for other in factories])[fed.sequence]
+            part, asked, item = lanes.chosen(chosen, paired.item)
+            answered[asked] = forecast(one, part, item, paired.frame[asked], name)
+        yield fed, paired, answered

@@ -300,21 +300,21 @@ def pairs(pairing: Pairing, fed: Histories) -> Pairs:
     sizes = np.maximum(pairing.end.take(cell + low) - begin, 0)
     item = np.repeat(np.arange(len(low)), sizes)
     frame = ranges(begin, sizes)
-    found = Pairs(item, frame, low.take(item), high.take(item))
+    listed = Pairs(item, frame, low.take(item), high.take(item))
     # a history of one sigma has no other pairs
-    several = np.flatnonzero(found.sigma_to - found.sigma_from > 1)
+    several = np.flatnonzero(listed.sigma_to - listed.sigma_from > 1)
     if not len(several):
-        return found
+        return listed
     output = fed.output.take(item.take(several))
     query = pairing.scale * frame.take(several)
     for ends, steps, limit in (
-        (found.sigma_from, pairing.steps, np.maximum),
-        (found.sigma_to, pairing.next_steps, np.minimum),
+        (listed.sigma_from, pairing.steps, np.maximum),
+        (listed.sigma_to, pairing.next_steps, np.minimum),
     ):
         seen = _place(pairing.sigmas, steps.take(output) - query)
         ends[several] = limit(seen, ends.take(several))
-    some = found.sigma_from < found.sigma_to
-    return found if some.all() else found.some(some)
+    kept = listed.sigma_from < listed.sigma_to
+    return listed if kept.all() else listed.some(kept)
 
 
 def _place(sigmas: Ints, values: Ints) -> Ints:

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from lae_sim._arrays import Floats, Ints
+from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.evaluation.metrics import (
     CENTRE_THRESHOLDS,
     METRICS,
@@ -60,8 +59,8 @@ class Scorer:
         """Score paired answers for so many sigmas, with the curves at one of them."""
         return self._scored(
             (
-                (np.repeat(fed.sequence, np.diff(fed.offsets)).take(found.item), found, boxes)
-                for fed, found, boxes in parts
+                (np.repeat(fed.sequence, np.diff(fed.offsets)).take(paired.item), paired, boxes)
+                for fed, paired, boxes in parts
             ),
             count,
             curves_at,
@@ -83,10 +82,10 @@ class Scorer:
     ) -> Scored:
         """Score answers, each part with the sequence of each pair, int64 [P]."""
         tally = _Tally(self._lengths, count, curves_at, self._convention.thresholds)
-        for sequence, found, boxes in parts:
+        for sequence, paired, boxes in parts:
             for begin in range(0, len(boxes), _CHUNK):
                 now = slice(begin, begin + _CHUNK)
-                some = found.some(now)
+                some = paired.some(now)
                 truth = self._truth.take(self._bases[sequence[now]] + some.frame, axis=1).T
                 counts = frame_counts(truth, boxes[now], some.frame, self._convention)
                 tally.add(sequence[now], some, counts)
@@ -104,7 +103,28 @@ class Scorer:
 
 
 class _Tally:
-    """Sums of what pairs count, by sequence and sigma."""
+    """Sums of what pairs count, by sequence and sigma, int64 [S, M] each.
+
+    A pair counts for a range of sigmas: its value is added where the range begins and taken off
+    where it ends, in M + 1 columns, so that a running sum along a row gives every sigma's total::
+
+        column               0     1     2     3     4 = M
+        value v for 0, 1    +v          -v
+        w for 1, 2, 3             +w                -w
+        running sum          v    v+w    w     w
+
+    Counts are whole, and small in a chunk, so that several share one float64, which is exact to 53
+    bits, and one ``bincount`` adds them all::
+
+        bit   51 50             34 33             17 16              0
+              |  |    within50    |   norm_dp20     |      dp20      |   17 bits each
+              |       norm_auc            |            auc           |   26 bits each
+              51                       26 25                         0
+
+    A chunk has 2**14 pairs, of which each adds at most 101 to ``auc`` and 1 to ``dp20``: the sums
+    take 21 and 15 bits, so that none reaches its neighbour. The steps may be negative, but each
+    count in a running sum is that of some pairs, and not below zero.
+    """
 
     def __init__(self, lengths: Ints, count: int, curves_at: int, thresholds: int) -> None:
         self._count, self._curves_at = count, curves_at
@@ -114,30 +134,30 @@ class _Tally:
         self.success = np.zeros((len(lengths), thresholds))
         self.precision = np.zeros((len(lengths), len(CENTRE_THRESHOLDS)))
 
-    def add(self, sequence: Ints, found: Pairs, counts: FrameCounts) -> None:
+    def add(self, sequence: Ints, paired: Pairs, counts: FrameCounts) -> None:
         """Add at most ``_CHUNK`` pairs, whose frames ascend in each sequence at each sigma."""
         here = sequence[np.diff(sequence, prepend=-1) != 0]  # each once: they ascend
         rank = np.zeros(here[-1] + 1, np.int64)
         rank[here] = np.arange(len(here))
         local, width = rank.take(sequence), self._count + 1
-        begin, end = local * width + found.sigma_from, local * width + found.sigma_to
+        begin, end = local * width + paired.sigma_from, local * width + paired.sigma_to
         size = len(here) * width
-        kinds: tuple[dict[str, Any], ...] = (
+        groups: tuple[Mapping[str, Floats | Bools], ...] = (
             {"auc": counts.success, "norm_auc": counts.norm},
             {"dp20": counts.dp, "norm_dp20": counts.norm_dp, "within50": counts.within50},
         )
-        for packed in kinds:
-            bits = _EXACT // len(packed)  # a chunk's sum of 101 thresholds takes 21, of flags 15
-            values = np.zeros(len(begin))
-            for k, each in enumerate(packed.values()):
-                values += each * 2.0 ** (k * bits)
-            steps = np.bincount(begin, values, size) - np.bincount(end, values, size)
+        for group in groups:
+            bits = _EXACT // len(group)
+            packed = np.zeros(len(begin))
+            for k, values in enumerate(group.values()):
+                packed += values * 2.0 ** (k * bits)
+            steps = np.bincount(begin, packed, size) - np.bincount(end, packed, size)
             sums = steps.reshape(-1, width).cumsum(axis=1)[:, : self._count].astype(np.int64)
-            for name in packed:
+            for name in group:
                 self.sums[name][here] += sums & (1 << bits) - 1
                 sums >>= bits
         shown = np.flatnonzero(
-            (found.sigma_from <= self._curves_at) & (self._curves_at < found.sigma_to)
+            (paired.sigma_from <= self._curves_at) & (self._curves_at < paired.sigma_to)
         )
         of_shown = local.take(shown)
         for curves, passed in (
@@ -146,19 +166,19 @@ class _Tally:
         ):
             shape = len(here), curves.shape[1]
             curves[here] += _above(of_shown, passed.take(shown).astype(np.int64), *shape)
-        self._note_failures(sequence, found, np.flatnonzero(counts.apart))
+        self._note_failures(sequence, paired, np.flatnonzero(counts.apart))
 
-    def _note_failures(self, sequence: Ints, found: Pairs, lost: Ints) -> None:
+    def _note_failures(self, sequence: Ints, paired: Pairs, lost: Ints) -> None:
         """Note the first pair of each sequence and sigma that is lost."""
-        begin = sequence[lost] * self._count + found.sigma_from[lost]
-        sizes = found.sigma_to[lost] - found.sigma_from[lost]
+        begin = sequence[lost] * self._count + paired.sigma_from[lost]
+        sizes = paired.sigma_to[lost] - paired.sigma_from[lost]
         # of losses in a row, in which one or two outputs answer each frame, the first will do
         new = np.ones(len(lost), np.bool_)
         for back in (1, 2):
             new[back:] &= (begin[back:] != begin[:-back]) | (sizes[back:] != sizes[:-back])
         begin, sizes, lost = begin[new], sizes[new], lost[new]
         at = ranges(begin, sizes)
-        np.minimum.at(self.failure.reshape(-1), at, np.repeat(found.frame[lost], sizes))
+        np.minimum.at(self.failure.reshape(-1), at, np.repeat(paired.frame[lost], sizes))
 
 
 def _columns(boxes: Sequence[Floats]) -> Floats:

@@ -1,1 +1,5 @@
 """Results that other toolkits have written, as recordings of a trace."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -136,7 +136,7 @@ class Examples:
 class Trainer(Protocol):
     """What makes a forecaster from examples; named like a forecaster, and tried across folds."""
 
-    def fit(self, examples: Examples, seed: int) -> ForecasterFactory:
+    def fit(self, examples: Examples, seed: int) -> AnyFactory:
         """The factory that these examples lead to."""
 
 

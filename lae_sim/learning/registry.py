@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
+from dataclasses import is_dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,18 +32,16 @@ forecasters:
   package.module:factory  your own
 """
 
-# name -> (module, attribute, whether it takes options)
-_BUILT_IN = {
-    "hold": ("forecast.base", "Hold", False),
-    "constant-velocity": ("forecast.base", "ConstantVelocity", False),
-    "kalman": ("forecast.kalman", "Kalman", False),
-    "kalman-lae-pvt": ("forecast.kalman", "KalmanLaePvt", False),
-    "g-h": ("forecast.filters", "GH", True),
-    "imm": ("forecast.filters", "IMM", True),
-    "least-squares": ("forecast.window", "LeastSquares", True),
-    "oracle": ("forecast.base", "Oracle", False),
-}
-_TRAINED = {"learned": "NetworkTrainer", "tuned-kalman": "KalmanTrainer"}
+BUILT_IN = (
+    "hold",
+    "constant-velocity",
+    "kalman",
+    "kalman-lae-pvt",
+    "g-h",
+    "imm",
+    "least-squares",
+    "oracle",
+)
 
 
 def load_forecaster(name: str, camera: Camera | None = None) -> AnyFactory:
@@ -76,31 +74,27 @@ def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:
     Raises:
         LaeError: as :func:`load_forecaster`.
     """
+    what = f"forecaster {name!r}"
     if name.startswith("camera+"):
-        if camera is None:
-            raise LaeError(f"{name} needs the frames: give the dataset's folder with --root")
-        from lae_sim.learning.folds import Trainer
+        return _over_camera(name, camera)
+    if name in ("learned", "tuned-kalman"):
+        from lae_sim.learning.trainers import KalmanTrainer, NetworkTrainer
 
-        base = load_any(name.removeprefix("camera+"), camera)
-        if isinstance(base, Trainer):
-            return _attribute("learning.trainers", "CameraTrainer")(base, camera)  # type: ignore[no-any-return]
-        return _attribute("forecast.camera", "CameraCompensated")(base, camera)  # type: ignore[no-any-return]
-    if name in _TRAINED:
-        return _attribute("learning.trainers", _TRAINED[name])()  # type: ignore[no-any-return]
+        return NetworkTrainer() if name == "learned" else KalmanTrainer()
     kind, colon, value = name.partition(":")
     if kind == "learned":
         from lae_sim.forecast.learned import read_learned
 
         return read_learned(Path(value))
-    if kind in _BUILT_IN:
-        return _built_in(name, kind, value)
+    if kind in BUILT_IN:
+        return _built_in(what, kind, value)
     if not colon:
-        names = ", ".join([*_BUILT_IN, "kalman:q=...", "learned:FILE.pt", "camera+NAME"])
-        raise LaeError(f"no forecaster {name!r}: there are {names}, and package.module:factory")
-    found = imported(f"forecaster {name!r}", name)
-    if isinstance(found, type) and hasattr(found, "fit"):
-        found = bound(f"forecaster {name!r}", found, [], {})
-    return found  # type: ignore[no-any-return]
+        names = ", ".join([*BUILT_IN, "kalman:q=...", "learned:FILE.pt", "camera+NAME"])
+        raise LaeError(f"no {what}: there are {names}, and package.module:factory")
+    factory: AnyFactory | Trainer = imported(what, name)
+    if isinstance(factory, type) and hasattr(factory, "fit"):
+        factory = bound(what, factory, [], {})
+    return factory
 
 
 def find_camera(
@@ -131,25 +125,58 @@ def find_camera(
     return Camera({sequence.name: sequence for sequence in found.sequences}, fps, lag)
 
 
-def _built_in(name: str, kind: str, value: str) -> AnyFactory:
-    module, attribute, takes_options = _BUILT_IN[kind]
-    if kind == "kalman" and value:
-        attribute, takes_options = "TunedKalman", True
-    found = _attribute(module, attribute)
-    if not takes_options:
-        if value:
-            raise LaeError(f"forecaster {name!r}: {kind} takes no options")
-        return found  # type: ignore[no-any-return]
-    options = parse_options(dict(map(key_and_value, value.split(",") if value else ())))
-    what = f"forecaster {name!r}"
-    try:
-        made = bound(what, found, [], options)
-    except TypeError as error:  # a text is no number
-        raise LaeError(f"{what}: one of its options must be a number") from error
+def _over_camera(name: str, camera: Camera | None) -> AnyFactory | Trainer:
+    if camera is None:
+        raise LaeError(f"{name} needs the frames: give the dataset's folder with --root")
+    from lae_sim.forecast.camera import CameraCompensated
+    from lae_sim.learning.folds import Trainer
+
+    base = load_any(name.removeprefix("camera+"), camera)
+    if isinstance(base, Trainer):
+        from lae_sim.learning.trainers import CameraTrainer
+
+        return CameraTrainer(base, camera)
+    return CameraCompensated(base, camera)
+
+
+def _built_in(what: str, kind: str, value: str) -> AnyFactory:
+    """A built-in forecaster with the options of a text, such as ``q=3,decay=0.99``."""
+    made = _class_of(kind, tuned=bool(value))
+    if is_dataclass(made):
+        options = parse_options(dict(map(key_and_value, value.split(",") if value else ())))
+        try:
+            made = bound(what, made, [], options)
+        except TypeError as error:  # a text is no number
+            raise LaeError(f"{what}: one of its options must be a number") from error
+        if kind == "least-squares":
+            from lae_sim.forecast.window import Windowed
+
+            made = Windowed(made)
+    elif value:
+        raise LaeError(f"{what}: {kind} takes no options")
+    factory: AnyFactory = made
+    return factory
+
+
+def _class_of(kind: str, tuned: bool) -> Any:
+    """The class of a built-in forecaster; a dataclass is of its options, and makes a factory.
+
+    What a command does not ask for is not imported.
+    """
+    if kind in ("g-h", "imm"):
+        from lae_sim.forecast.filters import GH, IMM
+
+        return GH if kind == "g-h" else IMM
     if kind == "least-squares":
-        made = _attribute("forecast.window", "Windowed")(made)
-    return made  # type: ignore[no-any-return]
+        from lae_sim.forecast.window import LeastSquares
 
+        return LeastSquares
+    if kind in ("kalman", "kalman-lae-pvt"):
+        from lae_sim.forecast.kalman import Kalman, KalmanLaePvt, TunedKalman
 
-def _attribute(module: str, name: str) -> Any:
-    return getattr(importlib.import_module(f"lae_sim.{module}"), name)
+        if kind == "kalman-lae-pvt":
+            return KalmanLaePvt
+        return TunedKalman if tuned else Kalman
+    from lae_sim.forecast.base import ConstantVelocity, Hold, Oracle
+
+    return {"hold": Hold, "constant-velocity": ConstantVelocity, "oracle": Oracle}[kind]

@@ -148,8 +148,8 @@ class KalmanTrainer:
     """Chooses q, decay and state of a :class:`TunedKalman` for the highest mean IoU with the truth.
 
     One parameter after another takes its best value, until none changes; r and p0 stay the paper's,
-    since the gains rest
-    on ratios alone, q / r and p0 / r, of which the second fades after few outputs.
+    since the gains rest on ratios alone, q / r and p0 / r, of which the second fades after few
+    outputs.
 
     Attributes:
         q, decay, state: the values to choose from.

@@ -1,1 +1,5 @@
 """Replaying recordings: under which world, with which processing times and boxes."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

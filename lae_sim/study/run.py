@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StudyResults:
     """The results of a study.
 
@@ -58,13 +58,33 @@ class StudyResults:
     failures: tuple[Failure, ...]
     training: tuple[str, ...] = ()
 
-    def table(self) -> DataFrame:
+    def to_frame(self) -> DataFrame:
         """Every score of every sequence, repetition and sigma (see :mod:`lae_sim.study.rows`)."""
         import pandas as pd
 
         store = Store(self.folder)
         files = [store.rows(cell) for cell in self.plan.cells if store.has(cell)]
         return pd.concat(map(pd.read_parquet, files), ignore_index=True)
+
+    def summary_frame(self) -> DataFrame:
+        """The summary as a table: the columns of ``summary.csv``."""
+        import pandas as pd
+
+        return pd.DataFrame(flat_rows(self.summary))
+
+    def __repr__(self) -> str:
+        cells, failed = len(self.plan.cells), len(self.failures)
+        more = f", {failed} of its parts failed" if failed else ""
+        return (
+            f"<StudyResults of {len(self.scores)} settings, {cells} cells in {self.folder}{more}>"
+        )
+
+    def _repr_html_(self) -> str:
+        table = self.summary_frame()
+        several = [name for name in table.columns[:12] if table[name].nunique() > 1]
+        shown = list(dict.fromkeys(["trace", *several, "forecaster", "sigma", "auc", "dp20"]))
+        html: str = table[shown].to_html(index=False, float_format="{:.4f}".format, na_rep="-")
+        return html
 
     def notes(self) -> list[str]:
         """What keeps the figures from being what their names promise, each once."""
@@ -104,7 +124,7 @@ class StudyResults:
         }
 
 
-def run_study(
+def compute_study(
     study: Study,
     folder: str | os.PathLike[str],
     base: Path | None = None,

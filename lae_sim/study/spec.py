@@ -14,7 +14,13 @@ from lae_sim.engine.clock import exact, parse_fps
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.metrics import find_convention
-from lae_sim.replay.world import check_sigmas, parse_latency, parse_policy, parse_sigmas
+from lae_sim.replay.world import (
+    check_sigmas,
+    named,
+    parse_latency,
+    parse_policy,
+    parse_sigmas,
+)
 
 RANDOM = ("bootstrap", "resample", "lognormal")
 """Latencies that are drawn anew in each repetition."""
@@ -67,6 +73,10 @@ class Study:
     require_auc: Fraction | None = None
 
     def __post_init__(self) -> None:
+        for key, (name, parse) in _KEYS.items():
+            value = getattr(self, name)
+            if not isinstance(value, tuple) and value is not None:  # as plain as in a file
+                object.__setattr__(self, name, named(key, parse, value))
         if not self.traces:
             raise LaeError("traces: a study needs at least one trace")
         if self.repetitions > 1_000_000:
@@ -101,10 +111,7 @@ class Study:
             if key not in _KEYS:
                 raise LaeError(f"unknown key {key!r}{_meant(key)}")
             name, parse = _KEYS[key]
-            try:
-                values[name] = parse(value)
-            except LaeError as error:
-                raise LaeError(f"{key}: {error}") from error
+            values[name] = named(key, parse, value)
         if "traces" not in values:
             raise LaeError("the key 'traces' is missing: name files, folders, globs or URLs")
         return cls(**values)

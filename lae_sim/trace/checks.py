@@ -34,14 +34,14 @@ def check_schema(schema: Any, where: str) -> None:
         TraceError: for the first column that is missing or of another type.
     """
     for name, expected in COLUMN_TYPES.items():
-        found = schema.get_all_field_indices(name)
-        if len(found) > 1:
-            raise TraceError(f"{where}: column {name!r} is there {len(found)} times")
-        if not found:
+        indices = schema.get_all_field_indices(name)
+        if len(indices) > 1:
+            raise TraceError(f"{where}: column {name!r} is there {len(indices)} times")
+        if not indices:
             if name in OPTIONAL and not (name in TRUTH and set(TRUTH) & set(schema.names)):
                 continue
             raise TraceError(f"{where}: column {name!r} is missing: is this a lae_sim trace?")
-        actual = _type_name(schema.field(found[0]).type)
+        actual = _type_name(schema.field(indices[0]).type)
         if actual != expected:
             raise TraceError(
                 f"{where}: column {name!r} is {actual}, must be {expected}"

@@ -54,9 +54,9 @@ def summary(elapsed_ns: Ints) -> dict[str, float]:
         return {"n": 0}
     p50, p90, p95, p99, top = (np.quantile(elapsed_ns, [0.5, 0.9, 0.95, 0.99, 1]) / 1e6).tolist()
     mean = float(elapsed_ns.mean()) / 1e6
-    found = {"n": len(elapsed_ns), "mean_ms": mean, "median_ms": p50, "p90_ms": p90}
-    found |= {"p95_ms": p95, "p99_ms": p99, "max_ms": top}
-    return found | ({"fps": 1e3 / mean} if mean else {})
+    figures = {"n": len(elapsed_ns), "mean_ms": mean, "median_ms": p50, "p90_ms": p90}
+    figures |= {"p95_ms": p95, "p99_ms": p99, "max_ms": top}
+    return figures | ({"fps": 1e3 / mean} if mean else {})
 
 
 def share_slower(elapsed_ns: Ints, fps: Fraction) -> float:
@@ -134,13 +134,13 @@ def stalls(sequences: Sequence[SequenceTimes]) -> list[dict[str, Any]]:
     """Calls that took over ten times the median of the run and of their sequence, longest first."""
     times = [sequence.elapsed_ns for sequence in sequences]
     middle = np.median(np.concatenate(times)) if sum(map(len, times)) else 0
-    found = []
+    longer = []
     for sequence in sequences:
         ns = sequence.elapsed_ns
         for call in np.flatnonzero(ns > STALL * max(middle, np.median(ns) if len(ns) else 0)):
             stall = {"sequence": sequence.name, "frame": int(sequence.frames[call])}
-            found.append({**stall, "ms": int(ns[call]) / 1e6, "first_call": bool(call == 0)})
-    return sorted(found, key=lambda stall: -stall["ms"])
+            longer.append({**stall, "ms": int(ns[call]) / 1e6, "first_call": bool(call == 0)})
+    return sorted(longer, key=lambda stall: -stall["ms"])
 
 
 def _medians(parts: Sequence[Any]) -> Floats:
@@ -185,7 +185,7 @@ def throttling(
 
 def gathered(**parts: Callable[[], Any]) -> Facts:
     """What the functions return, without what is empty or fails."""
-    found = {}
+    facts = {}
     for name, part in parts.items():
         try:
             value = part()
@@ -193,8 +193,8 @@ def gathered(**parts: Callable[[], Any]) -> Facts:
         except Exception:  # no oddity of a system file may end a profile of an hour
             continue
         if value not in (None, "", {}, []):
-            found[name] = value
-    return found
+            facts[name] = value
+    return facts
 
 
 Report = dict[str, Any]
@@ -215,13 +215,11 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
     """
     import numpy as np
 
-    from lae_sim.trace import describe as timing
-
     metadata = trace.metadata
     entries = metadata.document.get("sequences", {})
     sequences, frames, with_truth, sizes = [], 0, 0, Counter[str]()
     for recording in trace:
-        sequences.append(timing.SequenceTimes.of(recording))
+        sequences.append(SequenceTimes.of(recording))
         frames += len(recording)
         with_truth += int((~np.isnan(recording.truth[:, 0])).sum())
         size = metadata.image_size(recording.name)
@@ -245,15 +243,15 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
         "lost": sum(lost) if all(isinstance(n, int) for n in lost) else None,
         "failures": failures if isinstance(failures, list) else [],
         "times": {
-            "calls": timing.summary(calls),
-            "initialisations": timing.summary(np.array([s.init_ns for s in sequences])),
+            "calls": summary(calls),
+            "initialisations": summary(np.array([s.init_ns for s in sequences])),
             "frame_interval_ms": float(1000 / metadata.fps),
-            "slower_than_frames": timing.share_slower(calls, metadata.fps),
-            "histogram": timing.histogram(calls) if len(calls) else None,
-            "first_calls": timing.first_calls(sequences),
+            "slower_than_frames": share_slower(calls, metadata.fps),
+            "histogram": histogram(calls) if len(calls) else None,
+            "first_calls": first_calls(sequences),
             "order_known": ordered,
-            "drift": timing.drift(sequences),
-            "stalls": timing.stalls(sequences),
+            "drift": drift(sequences),
+            "stalls": stalls(sequences),
         },
     }
     return {**report, "warnings": list(_warnings(report, metadata))}, sequences
@@ -270,13 +268,13 @@ def _warnings(report: Report, metadata: Metadata) -> Iterator[str]:
         yield f"the last third of the run {longer}: heat, throttling, or harder sequences"
     device = metadata.document.get("device", {})
     taken = device.get("readings", {})
-    found = gathered(  # whatever another program wrote there
+    warnings = gathered(  # whatever another program wrote there
         busy=lambda: _busy(taken["before"]["load"][0], device["cpu"]),
         throttled=lambda: throttling(
             taken.get("before", {}), taken.get("during", []), taken.get("after", {})
         ),
     )
-    yield from found.values()
+    yield from warnings.values()
 
 
 def _busy(load: float, cpu: Mapping[str, Any]) -> str | None:

@@ -10,6 +10,7 @@ import os
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -30,19 +31,58 @@ class Trace:
     """A trace: its metadata, and its recordings sorted by name.
 
     Iterate over it to get the recordings; a trace that was read from a file is read again, batch by
-    batch, on every iteration.
+    batch, on every iteration. ``trace["Gull2"]`` is one of them; ``len(trace)`` and ``trace.names``
+    read the names alone.
+
+    Attributes:
+        metadata: what the trace says of itself.
+        recordings: one per sequence.
+        frames: world frames of all its sequences together, where known.
+
+    Example:
+        >>> import lae_sim
+        >>> trace = lae_sim.read_trace("traces/synthetic-slow.parquet")
+        >>> trace
+        <Trace of 'slow-and-accurate' on 'synthetic': 8 sequences, 2,400 frames at 30 fps>
+        >>> trace.names[:2], len(trace), len(trace["boat-calm"])
+        (('bike-pan', 'boat-calm'), 8, 300)
     """
 
     metadata: Metadata
     recordings: Iterable[Recording]
     frames: int | None = None
-    """World frames of all its sequences together, where known."""
 
     def __iter__(self) -> Iterator[Recording]:
         return iter(self.recordings)
 
+    def __bool__(self) -> bool:
+        return True  # a trace that is there; its length may have to be read
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names of the sequences, sorted."""
+        if isinstance(self.recordings, _StoredRecordings):
+            return self.recordings.names()
+        return tuple(recording.name for recording in self.recordings)
+
+    def __len__(self) -> int:
+        """Number of sequences."""
+        return len(self.names)
+
+    def __getitem__(self, name: str) -> Recording:
+        if isinstance(self.recordings, _StoredRecordings):
+            return next(iter(self.recordings.only(name)))
+        for recording in self.recordings:
+            if recording.name == name:
+                return recording
+        raise LaeError(f"the trace has no sequence {name!r}: there are {', '.join(self.names[:9])}")
+
     def __repr__(self) -> str:
-        return f"<Trace of {self.metadata.tracker!r} on {self.metadata.dataset!r}>"
+        about = f"{len(self):,} sequences"
+        if self.frames is not None and getattr(self.recordings, "keep", None) is None:
+            about += f", {self.frames:,} frames"
+        tracker, dataset = self.metadata.tracker, self.metadata.dataset
+        return f"<Trace of {tracker!r} on {dataset!r}: {about} at {self.metadata.fps} fps>"
 
 
 def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None = None) -> Trace:
@@ -148,6 +188,27 @@ class _StoredRecordings:
                 return Metadata.parse(stored), file.metadata.num_rows
             except TraceError as error:
                 raise TraceError(f"{self.path}: {error}") from error
+
+    def names(self) -> tuple[str, ...]:
+        """The names of the sequences that are kept, sorted; no other column is read."""
+        found: dict[str, None] = {}
+        with self._opened() as file:
+            for batch in file.iter_batches(2 * BATCH_ROWS, columns=["sequence"], use_threads=False):
+                found.update(dict.fromkeys(batch.column(0).dictionary.to_pylist()))
+        if self.keep is not None and not self.keep <= found.keys():
+            missing = sorted(self.keep - found.keys())
+            raise LaeError(f"{self.path}: no sequence {', '.join(map(repr, missing))}")
+        return tuple(sorted(found if self.keep is None else self.keep))
+
+    def only(self, name: str) -> _StoredRecordings:
+        """One sequence alone.
+
+        Raises:
+            LaeError: if it is not there, or is not kept.
+        """
+        if self.keep is not None and name not in self.keep:
+            raise LaeError(f"{self.path}: no sequence {name!r} of those chosen")
+        return replace(self, keep=frozenset([name]))
 
     def __iter__(self) -> Iterator[Recording]:
         missing = set(self.keep or ())

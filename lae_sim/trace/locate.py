@@ -28,7 +28,7 @@ def find_traces(patterns: Sequence[str], base: Path | None = None) -> list[str]:
     Raises:
         LaeError: if a pattern matches nothing or cannot be reached.
     """
-    found: dict[str, str] = {}
+    traces: dict[str, str] = {}
     for pattern in patterns:
         with _explained(pattern):
             names = _remote(pattern) if is_url(pattern) else _local(pattern, base)
@@ -36,8 +36,8 @@ def find_traces(patterns: Sequence[str], base: Path | None = None) -> list[str]:
             raise LaeError(f"{pattern}: no trace is there (of a folder, *.parquet are taken)")
         for name in sorted(names):
             same = name.removeprefix("file://")
-            found.setdefault(same if is_url(same) else os.path.realpath(same), name)
-    return list(found.values())
+            traces.setdefault(same if is_url(same) else os.path.realpath(same), name)
+    return list(traces.values())
 
 
 @contextmanager
@@ -73,8 +73,8 @@ def stamp(path: str) -> str:
     """Size and time of a local file, which change with it; empty of a URL or where it is not."""
     if is_url(path) or not os.path.exists(path):
         return ""
-    found = os.stat(path)
-    return f"{found.st_size} {found.st_mtime_ns}"
+    status = os.stat(path)
+    return f"{status.st_size} {status.st_mtime_ns}"
 
 
 def is_url(path: str) -> bool:
@@ -141,7 +141,7 @@ def _file_system(url: str) -> tuple[Any, str]:
 
 @contextmanager
 def _explained(path: str) -> Iterator[None]:
-    """Tell whatever goes wrong in one line: every file system has errors of its own."""
+    """Say whatever goes wrong in one line: every file system has errors of its own."""
     try:
         yield
     except FileNotFoundError as error:

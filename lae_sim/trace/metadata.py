@@ -138,8 +138,8 @@ class Metadata:
         return tuple(self._sequence(sequence).get("attributes", ()))
 
     def _sequence(self, sequence: str) -> Mapping[str, Any]:
-        found: Mapping[str, Any] = self.document.get("sequences", {}).get(sequence, {})
-        return found
+        entry: Mapping[str, Any] = self.document.get("sequences", {}).get(sequence, {})
+        return entry
 
 
 def _finite(text: str) -> float:

@@ -9,7 +9,7 @@ import scipy.io
 
 from lae_sim.cli.convert import main
 from lae_sim.engine.clock import Clock
-from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.run import replay_sequence
 from lae_sim.trace.file import read_trace
@@ -287,7 +287,7 @@ def test_help_is_light():
 def scores(path):
     trace = read_trace(path)
     runs = [replay_sequence(recording, Clock.at(trace.metadata.fps)) for recording in trace]
-    found = evaluate(runs, trace.metadata, {"hold": load_forecaster("hold")})
+    found = evaluate_runs(runs, trace.metadata, {"hold": load_forecaster("hold")})
     return (
         int(found.replay.frames.sum()),
         int(found.replay.processed.sum()),

@@ -3,8 +3,9 @@ from fractions import Fraction
 import pytest
 
 import lae_sim
+from lae_sim.engine.clock import Clock
 from lae_sim.engine.scheduler import scores_latency
-from lae_sim.replay.latency import bootstrap
+from lae_sim.replay.latency import bootstrap, lognormal, resampled
 from lae_sim.replay.world import parse_latency, parse_policy
 
 RECORDING = lae_sim.Recording.new(
@@ -21,8 +22,8 @@ def test_latencies_by_name():
     assert times(parse_latency("recorded")) == [90_000_000, 30_000_000, 2]
     assert times(parse_latency("by-call")) == [90_000_000, 40_000_000, 30_000_000]
     assert times(parse_latency("constant:4.7us")) == [4700, 4700, 4700]
-    assert times(parse_latency("resample:3")) == times(lae_sim.resampled(3))
-    assert times(parse_latency("lognormal:3")) == times(lae_sim.lognormal(3))
+    assert times(parse_latency("resample:3")) == times(resampled(3))
+    assert times(parse_latency("lognormal:3")) == times(lognormal(3))
     assert times(parse_latency("bootstrap:3")) == times(bootstrap(3))
     assert times(parse_latency("bootstrap:3:1")) == times(bootstrap(3, 1))
 
@@ -44,7 +45,7 @@ def test_a_policy_of_ones_own(name, tmp_path, monkeypatch):
     (tmp_path / "own_rules.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
     policy = parse_policy(f"own_rules:{name}")
-    assert policy(lae_sim.Clock.at(Fraction(1)), [(0, 0, 7)]) == (9, 9_000_000_007)
+    assert policy(Clock.at(Fraction(1)), [(0, 0, 7)]) == (9, 9_000_000_007)
     assert scores_latency(policy)
 
 
@@ -57,7 +58,7 @@ def test_a_latency_of_ones_own(tmp_path, monkeypatch):
 
 
 def test_policies_by_name():
-    clock = lae_sim.Clock.at(Fraction(10))
+    clock = Clock.at(Fraction(10))
     calls = [(0, 0, 3_500_000_000)]  # free half-way between frames 3 and 4
     expected = {
         "latest": (3, 3_500_000_000),

@@ -184,7 +184,7 @@ def test_a_frame_without_an_answer_costs_that_frame(here: Path) -> None:
 
 
 def test_real_time_skips_frames_and_replays_to_the_bit(here: Path) -> None:
-    options = ("--mode", "real-time", "--option", "ms=45", "--out", "t.parquet")
+    options = ("--mode", "real-time", "--option", "ms=50", "--out", "t.parquet")
     profile(here, *MINE, *options, "--sequence", "a")
     trace = read_trace(here / "t.parquet")
     assert trace.metadata.kind == "real-time"

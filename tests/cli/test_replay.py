@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from collections import Counter
 from fractions import Fraction
 
 import numpy as np
@@ -12,7 +13,15 @@ import pytest
 from places import REPOSITORY
 
 import lae_sim
+from lae_sim.cli import replay as replay_command
+from lae_sim.engine import scheduler
+from lae_sim.engine.policies import every, fifo, shrinking_tail, vot_realtime
+from lae_sim.evaluation import pairing
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.evaluation.events import KINDS
+from lae_sim.evaluation.metrics import success_curve
+from lae_sim.forecast import base
+from lae_sim.replay.latency import constant
 from lae_sim.report.figures import sweep_figure
 
 SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
@@ -99,10 +108,10 @@ def test_the_table_has_a_line_for_each_trace_and_forecaster():
 def test_json_agrees_with_the_api():
     report = replay_json(SLOW, "--latency", "constant:47ms", "--sigma", "0", "1/2")["traces"][0]
     trace = lae_sim.read_trace(SLOW)
-    runs = lae_sim.replay_trace(trace, latency=lae_sim.constant(ns=47_000_000))
+    runs = lae_sim.replay_trace(trace, latency=constant(ns=47_000_000))
     forecasters = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
     sigmas = [Fraction(0), Fraction(1, 2)]
-    found = lae_sim.evaluate(runs, trace.metadata, forecasters, sigmas)
+    found = evaluate_runs(runs, trace.metadata, forecasters, sigmas)
     assert report["world_frames"] == found.replay.frames.sum() == trace.frames
     assert report["processed"] == found.replay.processed.sum()
     assert report["mismatch_sum"] == found.staleness.mismatch_sum[:, 0].sum()
@@ -158,10 +167,10 @@ def test_policies_by_name(policy):
     report = replay_json(SLOW, "--policy", policy)["traces"][0]
     name = policy.split(":")[0]
     by_name = {
-        "fifo": lae_sim.fifo,
-        "every": lae_sim.every(2),
-        "shrinking-tail": lae_sim.shrinking_tail(ns=47_000_000),
-        "vot-realtime": lae_sim.vot_realtime(),
+        "fifo": fifo,
+        "every": every(2),
+        "shrinking-tail": shrinking_tail(ns=47_000_000),
+        "vot-realtime": vot_realtime(),
     }
     runs = list(lae_sim.replay_trace(lae_sim.read_trace(SLOW), policy=by_name[name]))
     assert report["policy"] == policy
@@ -223,7 +232,7 @@ def test_result_text_files_score_as_the_table_says(tmp_path):
             boxes = np.loadtxt(path, delimiter=",")
             assert boxes.shape == (len(recording), 4)
             pysot = lae_sim.CONVENTIONS["pysot"]
-            scores.append(lae_sim.success_curve(recording.truth, boxes, pysot).mean())
+            scores.append(success_curve(recording.truth, boxes, pysot).mean())
         assert np.mean(scores) == pytest.approx(result["auc"], abs=1e-12)
     error = replay(SLOW, "--export-txt", tmp_path / "results", status=2)
     assert "is there already" in error
@@ -469,3 +478,42 @@ def test_a_reader_that_goes_away_is_no_error():
         ["bash", "-o", "pipefail", "-c", script], capture_output=True, text=True, cwd=REPOSITORY
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twice(
+    tmp_path, monkeypatch, capsys
+):
+    calls = Counter()
+    for function in (scheduler.simulate, pairing.pair, base.forecast):
+        name = function.__name__
+
+        def counted(*arguments, _function=function, _name=name, **named):
+            calls[_name] += 1
+            return _function(*arguments, **named)
+
+        for module in [m for key, m in sys.modules.items() if key.startswith("lae_sim.")]:
+            if getattr(module, name, None) is function:
+                monkeypatch.setattr(module, name, counted)
+    asked = [str(SLOW), "--cost", "kalman=2ms", "--sigma", "1/2", "0", "--json"]
+    assert replay_command.main(asked) == 0
+    plain, alone = capsys.readouterr().out, calls.copy()
+    # one group of sequences: a pairing for each cost, and each forecaster once
+    assert alone == {"simulate": 8, "pair": 2, "forecast": 2}
+    calls.clear()
+    files = {
+        "--plot": "plot.svg",
+        "--outputs": "outputs.parquet",
+        "--schedule": "schedule.parquet",
+        "--events": "events.jsonl",
+        "--timeline": "timeline.json",
+        "--export-txt": "results",
+    }
+    for option, name in files.items():
+        asked += [option, str(tmp_path / name)]
+    assert replay_command.main(asked) == 0
+    assert capsys.readouterr().out == plain
+    assert calls == alone
+    assert {path.name for path in tmp_path.iterdir()} == set(files.values())
+    calls.clear()
+    assert replay_command.main([str(SLOW), "--timeline", str(tmp_path / "timeline.svg")]) == 0
+    assert calls == {"simulate": 8, "pair": 1, "forecast": 2}

@@ -24,11 +24,12 @@ import lae_sim
 from lae_sim.cli.study import main
 from lae_sim.comparison.forecasters import compare_forecasters
 from lae_sim.errors import LaeError
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.learning.trainers import KalmanTrainer
-from lae_sim.replay.latency import bootstrap, scaled
+from lae_sim.replay.latency import bootstrap, by_frame, constant, scaled
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study import rows as cell_rows
-from lae_sim.study.run import StudyResults, run_study
+from lae_sim.study.run import StudyResults, compute_study
 from lae_sim.study.spec import Study
 
 SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
@@ -74,7 +75,7 @@ class Stay:
 
 def run(folder: Path, study: Study | None = None, workers: int = 1, **more: Any) -> StudyResults:
     study = study or Study((str(SLOW), str(FAST)), sequences=FEW, **more)
-    return run_study(study, folder, workers=workers)
+    return compute_study(study, folder, workers=workers)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -125,13 +126,13 @@ def test_every_row_is_what_replaying_and_scoring_one_by_one_gives(tmp_path: Path
         trace = lae_sim.read_trace(path, FEW)
         for latency, repetition in [*((name, 0) for name in latencies), ("bootstrap", 2)]:
             source = {
-                "recorded": lae_sim.by_frame,
+                "recorded": by_frame,
                 "bootstrap": bootstrap(5, 7, repetition),
-                "constant:47ms": lae_sim.constant(ns=47_000_000),
+                "constant:47ms": constant(ns=47_000_000),
             }[latency]
             for scale in scales:
                 runs = [*lae_sim.replay_trace(trace, latency=scaled(source, scale))]
-                found = lae_sim.evaluate(runs, trace.metadata, forecasters, sigmas)
+                found = evaluate_runs(runs, trace.metadata, forecasters, sigmas)
                 for f, forecaster in enumerate(forecasters):
                     for s, name in enumerate(FEW):
                         for m, sigma in enumerate(sigmas):
@@ -155,7 +156,7 @@ def test_every_row_is_what_replaying_and_scoring_one_by_one_gives(tmp_path: Path
 def test_the_summary_has_the_means_of_replay(tmp_path: Path) -> None:
     results = run(tmp_path, sigmas=SIGMA_GRID)
     trace = lae_sim.read_trace(SLOW, FEW)
-    found = lae_sim.evaluate(
+    found = evaluate_runs(
         lae_sim.replay_trace(trace),
         trace.metadata,
         {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman},
@@ -259,9 +260,9 @@ def test_what_a_required_auc_asks_for_is_true(tmp_path: Path) -> None:
     trace = lae_sim.read_trace(SLOW)
 
     def auc(scale: str) -> float:
-        source = scaled(lae_sim.by_frame, Fraction(scale))
+        source = scaled(by_frame, Fraction(scale))
         runs = lae_sim.replay_trace(trace, latency=source)
-        scores = lae_sim.evaluate(runs, trace.metadata, {"hold": lae_sim.Hold}).scores["auc"]
+        scores = evaluate_runs(runs, trace.metadata, {"hold": lae_sim.Hold}).scores["auc"]
         return float(scores.mean())
 
     assert found["auc"] == pytest.approx(auc(found["scale"]))
@@ -394,7 +395,7 @@ def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A study with everything in it, computed in this process."""
     folder = tmp_path_factory.mktemp("alone")
-    run_study(BROAD, folder, workers=1)
+    compute_study(BROAD, folder, workers=1)
     return folder
 
 
@@ -409,7 +410,7 @@ BROAD = Study(
 
 
 def test_results_are_the_same_bytes_for_any_number_of_workers(alone: Path, tmp_path: Path) -> None:
-    run_study(BROAD, tmp_path, workers=3)
+    compute_study(BROAD, tmp_path, workers=3)
     assert contents(tmp_path) == contents(alone)
 
 
@@ -435,7 +436,7 @@ def test_a_cluster_gives_the_same_though_a_worker_is_killed(
             killed.append(worker.process.process.pid)
             os.kill(killed[0], signal.SIGKILL)
 
-    results = run_study(BROAD, tmp_path, scheduler=cluster.scheduler_address, progress=progress)
+    results = compute_study(BROAD, tmp_path, scheduler=cluster.scheduler_address, progress=progress)
     assert killed
     assert not results.failures
     assert contents(tmp_path) == contents(alone)
@@ -512,7 +513,7 @@ def test_a_trace_that_changes_meanwhile_is_not_taken_for_what_it_was(tmp_path: P
 
     study = Study((str(mine),), sequences=FEW, scales=(Fraction(1), Fraction(2)))
     with pytest.raises(LaeError, match="changed since the study began"):
-        run_study(study, tmp_path / "out", workers=1, progress=progress)
+        compute_study(study, tmp_path / "out", workers=1, progress=progress)
     shutil.copy(FAST, mine)
     assert run(tmp_path / "out", study).computed == 4
 

@@ -18,7 +18,7 @@ from lae_sim.cli.replay import main as replay
 from lae_sim.cli.train import main
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.caveats import notes_on
-from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.evaluation.metrics import PYSOT
 from lae_sim.forecast.base import Hold
 from lae_sim.forecast.camera import Camera, CameraCompensated
@@ -89,7 +89,7 @@ def test_a_part_of_the_same_video_counts_as_seen() -> None:
     recordings = [moving(9, 0, name) for name in ("car1_2", "car2_1")]
     runs = [replay_sequence(recording, Clock.at(Fraction(30))) for recording in recordings]
     metadata = Metadata.new("30", "every-frame")
-    found = evaluate(runs, metadata, {"hold": Hold})
+    found = evaluate_runs(runs, metadata, {"hold": Hold})
     rule = Learned(None, {"sequences": ["car1_1", "bus"]})
     camera = CameraCompensated(Windowed(rule), Camera({}, Fraction(30)))
     forecasters = {"hold": Hold, "one": Windowed(rule), "two": camera}

@@ -17,7 +17,7 @@ from lae_sim.comparison.statistics import summarise
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import fifo
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.evaluation.metrics import METRICS, find_convention
 from lae_sim.forecast.base import ConstantVelocity, Hold, Oracle
 from lae_sim.forecast.kalman import Kalman
@@ -83,7 +83,7 @@ def test_every_value_is_what_evaluate_gives(slow: Trace, fast: Trace) -> None:
         for latency, source in sources.items():
             for scale in scales:
                 runs = Runs(trace, Clock.at(fps), scaled(source, scale), fifo)
-                found = evaluate(runs, trace.metadata, ready, sigmas, convention)
+                found = evaluate_runs(runs, trace.metadata, ready, sigmas, convention)
                 for m in METRICS:
                     here = label, latency, float(scale), m
                     for k, sigma in enumerate(map(float, sigmas)):
@@ -166,7 +166,7 @@ def test_costs_delay_the_answers(slow: Trace) -> None:
     table = score_forecasters({"slow": slow}, FORECASTERS, [World(costs=("kalman=40ms",))])
     costs = {"kalman": 40_000_000}
     runs = list(replay_trace(slow))
-    found = evaluate(runs, slow.metadata, {"kalman": Kalman}, costs=costs)
+    found = evaluate_runs(runs, slow.metadata, {"kalman": Kalman}, costs=costs)
     got = values(table, forecaster="kalman", metric="auc")
     np.testing.assert_array_equal(got, found.scores["auc"][0, :, 0])
     assert got.mean() < values(free, forecaster="kalman", metric="auc").mean()

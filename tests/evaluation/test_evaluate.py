@@ -28,8 +28,15 @@ from lae_sim.boxes import iou
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import vot_realtime
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import Evaluation, answers, evaluate
-from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, precision_curve, success_curve
+from lae_sim.evaluation.evaluate import (
+    Evaluation,
+    ScoredRun,
+    answers,
+    evaluate_groups,
+    evaluate_runs,
+)
+from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, PYSOT, precision_curve, success_curve
+from lae_sim.evaluation.pairing import pair
 from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
 from lae_sim.replay.latency import constant
@@ -79,7 +86,7 @@ def test_scores_agree_with_plain_loops_over_the_oracle(
     fps, recordings = group
     clock = Clock.at(fps)
     runs = [replay_sequence(recording, clock) for recording in recordings]
-    found = evaluate(runs, EVERY, FORECASTERS, sigmas, CONVENTIONS[name])
+    found = evaluate_runs(runs, EVERY, FORECASTERS, sigmas, CONVENTIONS[name])
     chosen = sorted({0, len(sigmas) // 2, len(sigmas) - 1})
     for s, (recording, run) in enumerate(zip(recordings, runs)):
         truth = plain_truth(recording)
@@ -108,7 +115,7 @@ def test_curves_and_failures_agree_with_those_of_single_sequences(
     fps, recordings = group
     convention = CONVENTIONS[name]
     runs = [replay_sequence(recording, Clock.at(fps)) for recording in recordings]
-    found = evaluate(runs, EVERY, FORECASTERS, sigmas, convention)
+    found = evaluate_runs(runs, EVERY, FORECASTERS, sigmas, convention)
     for s, run in enumerate(runs):
         truth = run.recording.truth
         valid = convention.valid_success(truth)
@@ -154,7 +161,7 @@ def test_evaluation_agrees_with_the_event_driven_world(
 ) -> None:
     fps, recordings = group
     runs = [replay_sequence(recording, Clock.at(fps)) for recording in recordings]
-    found = evaluate(runs, EVERY, {"kalman": Kalman}, sigmas)
+    found = evaluate_runs(runs, EVERY, {"kalman": Kalman}, sigmas)
     for s, recording in enumerate(recordings):
         processed, tellings = event_driven(
             fps, recording.elapsed_ns.tolist(), recording.boxes.tolist(), sigmas
@@ -176,10 +183,10 @@ def test_the_grid_is_its_sigmas_one_by_one_and_groups_are_their_sequences(
         replace(run, schedule=replace(run.schedule, scores_latency=scores_latency)) for run in runs
     ]
     sigmas = [Fraction(-1, 2), *SIGMA_GRID[::5], Fraction(4, 3)]
-    together = evaluate(runs, EVERY, FORECASTERS, sigmas)
+    together = evaluate_runs(runs, EVERY, FORECASTERS, sigmas)
     for s, run in enumerate(runs):
         for m, sigma in enumerate(sigmas):
-            alone = evaluate([run], EVERY, FORECASTERS, [sigma])
+            alone = evaluate_runs([run], EVERY, FORECASTERS, [sigma])
             for metric in METRICS:
                 np.testing.assert_array_equal(
                     together.scores[metric][:, s, m], alone.scores[metric][:, 0, 0]
@@ -190,12 +197,12 @@ def test_the_grid_is_its_sigmas_one_by_one_and_groups_are_their_sequences(
 
 def test_streaming_and_lane_forecasters_score_the_same() -> None:
     runs = [replay_sequence(moving(60, seed, f"s{seed}"), CLOCK) for seed in range(4)]
-    lanes = evaluate(runs, EVERY, FORECASTERS, SIGMA_GRID)
+    lanes = evaluate_runs(runs, EVERY, FORECASTERS, SIGMA_GRID)
     streaming = {
         name: lambda box, size, factory=factory: factory(box, size)
         for name, factory in FORECASTERS.items()
     }
-    found = evaluate(runs, EVERY, streaming, SIGMA_GRID)
+    found = evaluate_runs(runs, EVERY, streaming, SIGMA_GRID)
     for metric in METRICS:
         assert found.scores[metric].tobytes() == lanes.scores[metric].tobytes()
 
@@ -241,7 +248,7 @@ def test_counts_by_hand() -> None:
     recording = Recording.new("a", np.ones((5, 4)), np.ones((5, 4)), times)
     run = replay_sequence(recording, Clock.at(Fraction(25)))
     assert run.schedule.frames.tolist() == [0, 2, 3, 4]
-    found = evaluate([run], EVERY, {"hold": Hold}, [Fraction(0), Fraction(1, 2)])
+    found = evaluate_runs([run], EVERY, {"hold": Hold}, [Fraction(0), Fraction(1, 2)])
     assert found.replay.sequences == ("a",)
     assert found.replay.frames.tolist() == [5]
     assert found.replay.processed.tolist() == [4]
@@ -259,7 +266,7 @@ def test_offline_scores_need_every_frame() -> None:
     full = moving(40)
     run = replay_sequence(full, CLOCK)
     sparse = Recording.of_run("b", run.schedule, run.boxes, full.truth)
-    found = evaluate([run, replay_sequence(sparse, CLOCK)], EVERY, {"hold": Hold})
+    found = evaluate_runs([run, replay_sequence(sparse, CLOCK)], EVERY, {"hold": Hold})
     for metric in METRICS:
         assert np.isnan(found.offline[metric]).tolist() == [False, True]
         assert found.scores[metric][0, 0, 0] == found.scores[metric][0, 1, 0]
@@ -269,7 +276,7 @@ def test_joined_is_the_evaluation_of_all() -> None:
     runs = [replay_sequence(moving(20 + seed, seed, f"s{seed}"), CLOCK) for seed in range(5)]
 
     def of(some: list[Run]) -> Evaluation:
-        return evaluate(some, EVERY, FORECASTERS, SIGMA_GRID)
+        return evaluate_runs(some, EVERY, FORECASTERS, SIGMA_GRID)
 
     whole = of(runs)
     joined = Evaluation.joined([of(runs[a:b]) for a, b in pairwise([0, 2, 3, 5])])
@@ -284,10 +291,71 @@ def test_joined_is_the_evaluation_of_all() -> None:
         assert joined.offline[metric].tobytes() == whole.offline[metric].tobytes()
 
 
+COSTS = {"kalman": 15_000_000}
+
+
+@pytest.mark.parametrize("frames", [1, 60, 10**6])
+def test_observers_see_what_is_scored(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lae_sim.evaluation.evaluate._PART", 40)  # outputs: a sequence or two
+    runs = [replay_sequence(moving(20 + 9 * seed, seed, f"s{seed}"), CLOCK) for seed in range(5)]
+    sigmas = [Fraction(-1, 3), Fraction(0), Fraction(3, 4)]
+    observed = [(name, sigma) for name in ("kalman", "hold") for sigma in (sigmas[2], sigmas[0])]
+    seen: list[ScoredRun] = []
+    more = {"frames": frames, "observers": [seen.append], "observed": observed}
+    parts = evaluate_groups(runs, EVERY, FORECASTERS, sigmas, costs=COSTS, **more)  # type: ignore[arg-type]
+    found = Evaluation.joined(list(parts))
+    assert [scored.run for scored in seen] == runs
+    for s, (run, scored) in enumerate(zip(runs, seen)):
+        assert set(scored.answers) == set(observed)
+        for (name, sigma), one in scored.answers.items():
+            cost = COSTS.get(name, 0)
+            separate = answers(run, EVERY, name, FORECASTERS[name], sigma, cost)
+            assert one.boxes.tobytes() == separate.boxes.tobytes()
+            assert one.source_frame.tolist() == separate.source_frame.tolist()
+            score = success_curve(run.recording.truth, one.boxes, PYSOT).mean()
+            f, m = list(FORECASTERS).index(name), sigmas.index(sigma)
+            assert found.scores["auc"][f, s, m] == pytest.approx(score)
+        for sigma in sigmas:
+            for cost in (0, *COSTS.values()):
+                chosen, alone = scored.pairing(sigma, cost), pair([run.schedule], [sigma], cost)
+                for field in ("lengths", "offsets", "frames", "first", "end"):
+                    assert getattr(chosen, field).tolist() == getattr(alone, field).tolist()
+                for field in ("mismatch_sum", "mismatch_max", "longest_hold"):
+                    assert getattr(chosen, field).tolist() == getattr(alone, field).tolist()
+
+
+def test_curves_are_at_the_sigma_that_is_asked_for() -> None:
+    runs = [replay_sequence(moving(30, seed, f"s{seed}"), CLOCK) for seed in range(3)]
+    sigmas = [Fraction(0), Fraction(1, 2), Fraction(1)]
+    for sigma in sigmas:
+        (part,) = evaluate_groups(runs, EVERY, FORECASTERS, sigmas, curves_at=sigma)
+        only = evaluate_runs(runs, EVERY, FORECASTERS, [sigma])
+        assert part.curves.success.tobytes() == only.curves.success.tobytes()
+        assert part.curves.precision.tobytes() == only.curves.precision.tobytes()
+    first = evaluate_runs(runs, EVERY, FORECASTERS, sigmas).curves.success
+    assert first.tobytes() == evaluate_runs(runs, EVERY, FORECASTERS).curves.success.tobytes()
+
+
+def test_nothing_to_evaluate_is_said() -> None:
+    with pytest.raises(LaeError, match="no sequences"):
+        evaluate_runs([], EVERY, FORECASTERS)
+    with pytest.raises(LaeError, match="at least one forecaster"):
+        evaluate_runs([replay_sequence(moving(9), CLOCK)], EVERY, {})
+
+
+def test_chosen_sequences_keep_their_statistics() -> None:
+    runs = [replay_sequence(moving(20 + seed, seed, f"s{seed}"), CLOCK) for seed in range(5)]
+    replay = evaluate_runs(runs, EVERY, {"hold": Hold}).replay
+    some = replay.chosen(np.array([3, 1]))
+    assert some.sequences == ("s3", "s1")
+    assert some.frames.tolist() == [23, 21]
+    assert some.calls_ns.tolist() == replay.calls_ns[[3, 1]].tolist()
+
+
 def test_vot_scores_each_output_at_its_own_frame() -> None:
     recording = moving(50, elapsed=10_000_000)
     run = replay_sequence(recording, CLOCK, policy=vot_realtime())
-    found = evaluate([run], EVERY, {"hold": Hold})
+    found = evaluate_runs([run], EVERY, {"hold": Hold})
     for metric in METRICS:
         assert found.scores[metric].item() == found.offline[metric].item()
     assert found.staleness.mismatch_sum.item() == 0
@@ -302,7 +370,7 @@ def test_a_forecaster_that_answers_nonsense_is_named() -> None:
         return Nonsense(box)
 
     with pytest.raises(LaeError, match="mine: predicted"):
-        evaluate([replay_sequence(moving(9), CLOCK)], EVERY, {"mine": factory})
+        evaluate_runs([replay_sequence(moving(9), CLOCK)], EVERY, {"mine": factory})
 
 
 @pytest.mark.parametrize("size", [1e-300, 1e-9, 1e9])
@@ -310,6 +378,6 @@ def test_tiny_and_huge_boxes_are_scored_without_a_warning(size: float) -> None:
     boxes = moving(30).boxes * size
     recording = Recording.new("a", boxes, boxes[::-1], [40_000_000] * 30)
     metadata = Metadata.new("30", "every-frame", sequences={"a": {"image_size": [640, 360]}})
-    found = evaluate([replay_sequence(recording, CLOCK)], metadata, FORECASTERS, SIGMA_GRID)
+    found = evaluate_runs([replay_sequence(recording, CLOCK)], metadata, FORECASTERS, SIGMA_GRID)
     for metric in METRICS:
         assert ((found.scores[metric] >= 0) & (found.scores[metric] <= 1)).all()

@@ -3,9 +3,11 @@ from fractions import Fraction
 import numpy as np
 
 import lae_sim
+from lae_sim.engine.clock import Clock
+from lae_sim.engine.policies import fifo
 
 # 10 frames/s: one tick is 0.1 ns, a frame is 100 ms = 10**9 ticks.
-CLOCK = lae_sim.Clock.at(Fraction(10))
+CLOCK = Clock.at(Fraction(10))
 MS = 10**7
 
 
@@ -66,8 +68,8 @@ def test_queries_come_sigma_later_and_between_ticks_count_down():
 def test_outputs_of_one_tick_stand_in_the_order_of_their_making():
     boxes = np.zeros((3, 4))
     recording = lae_sim.Recording.new("sequence", boxes, boxes, np.array([250_000_000, 0, 0]))
-    fifo = lae_sim.replay_sequence(recording, CLOCK, policy=lae_sim.fifo)
-    log = lae_sim.event_log(fifo)
+    queued = lae_sim.replay_sequence(recording, CLOCK, policy=fifo)
+    log = lae_sim.event_log(queued)
     assert [event[1:3] for event in log if event.tick == 250 * MS] == [
         ("output ready", 0),
         ("processing started", 1),

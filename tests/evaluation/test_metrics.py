@@ -14,7 +14,7 @@ from witness import overlap, scores
 from lae_sim.boxes import centre, iou
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import Evaluation, evaluate
+from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
 from lae_sim.evaluation.metrics import (
     CONVENTIONS,
     METRICS,
@@ -39,7 +39,7 @@ def evaluated(truth: object, boxes: object, name: str) -> Evaluation:
     recording = Recording.new("a", truth, boxes, np.zeros(len(boxes)))
     run = replay_sequence(recording, Clock.at(Fraction(30)))
     metadata = Metadata.new("30", "every-frame")
-    return evaluate([run], metadata, {"hold": Hold}, convention=CONVENTIONS[name])
+    return evaluate_runs([run], metadata, {"hold": Hold}, convention=CONVENTIONS[name])
 
 
 def offline(truth: object, boxes: object, name: str) -> dict[str, float]:

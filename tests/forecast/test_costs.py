@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from witness import moving
 
-from lae_sim.comparison.forecasters import compare_forecasters
+from lae_sim.comparison.forecasters import score_forecasters
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import answers, evaluate
+from lae_sim.evaluation.evaluate import answers, evaluate_runs
 from lae_sim.forecast.base import ConstantVelocity, Hold, Oracle
 from lae_sim.forecast.costs import cost_notes, measure_cost, parse_cost, resolve_costs
 from lae_sim.forecast.kalman import Kalman
 from lae_sim.replay.run import replay_sequence
+from lae_sim.replay.world import World
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
@@ -40,7 +41,7 @@ SIGMAS = [Fraction(0), Fraction(1, 2)]
         (["kalman:q=3=7ns"], {"kalman:q=3": 7}),
     ],
 )
-def test_costs_as_told(told: list[str], expected: dict[str, int]) -> None:
+def test_costs_as_declared(told: list[str], expected: dict[str, int]) -> None:
     assert resolve_costs(told, FACTORIES, RECORDINGS) == expected
 
 
@@ -91,9 +92,9 @@ def test_a_measured_cost_is_that_of_one_answer() -> None:
 
 
 def test_a_cost_lowers_the_scores_of_those_who_pay_it_alone() -> None:
-    free = evaluate(RUNS, EVERY, FACTORIES, SIGMAS)
-    zero = evaluate(RUNS, EVERY, FACTORIES, SIGMAS, costs=dict.fromkeys(FACTORIES, 0))
-    paid = evaluate(RUNS, EVERY, FACTORIES, SIGMAS, costs={"kalman": 20_000_000, "absent": 9})
+    free = evaluate_runs(RUNS, EVERY, FACTORIES, SIGMAS)
+    zero = evaluate_runs(RUNS, EVERY, FACTORIES, SIGMAS, costs=dict.fromkeys(FACTORIES, 0))
+    paid = evaluate_runs(RUNS, EVERY, FACTORIES, SIGMAS, costs={"kalman": 20_000_000, "absent": 9})
     for metric, scores in free.scores.items():
         np.testing.assert_array_equal(zero.scores[metric], scores)
         np.testing.assert_array_equal(paid.scores[metric][[0, 2]], scores[[0, 2]])
@@ -117,7 +118,9 @@ def test_an_answer_that_costs_a_frame_is_the_answer_for_the_frame_before_told_la
 def test_a_comparison_counts_and_tells_costs() -> None:
     traces = {"t": Trace(EVERY, RECORDINGS)}
     factories = {"kalman": Kalman}
-    free, paid = (compare_forecasters(traces, factories, costs=costs) for costs in ((), ("20ms",)))
+    free, paid = (
+        score_forecasters(traces, factories, [World(costs=costs)]) for costs in ((), ("20ms",))
+    )
     changed = (free["value"] != paid["value"]) & free["value"].notna()
     assert set(free["forecaster"][changed]) == {"kalman"}
     assert any("kalman 20000 us" in note for note in paid.attrs["notes"])

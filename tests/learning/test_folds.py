@@ -17,7 +17,7 @@ from lae_sim.comparison.forecasters import score_forecasters
 from lae_sim.datasets.annotations import video_of
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.evaluate import evaluate
+from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.forecast.base import Hold
 from lae_sim.learning.folds import CrossFitted, Examples, assign_folds, cross_fitted
 from lae_sim.replay.latency import constant
@@ -223,7 +223,7 @@ def test_no_fold_is_trained_on_the_sequences_it_is_scored_on(folds: int, seed: i
     dealt = assign_folds(NAMES, folds, seed)
     told: list[None] = []
     fitted = cross_fitted(trainer, Examples.of(runs), dealt, seed, lambda: told.append(None))
-    evaluate(runs, Metadata.new("30", "every-frame"), {"fake": fitted})
+    evaluate_runs(runs, Metadata.new("30", "every-frame"), {"fake": fitted})
     assert len(told) == len(trainer.seen)
     assert_honest(trainer, min(folds, 6))
 

@@ -19,7 +19,6 @@ import pytest
 
 from lae_sim import __version__
 from lae_sim.profile import device
-from lae_sim.profile import device as sensors
 from lae_sim.profile.device import describe_device, readings, source_version
 from lae_sim.trace.describe import throttling
 
@@ -303,7 +302,7 @@ def test_a_gpu_that_says_nothing(tmp_path: Path, script: str) -> None:
 @needs_sh
 def test_a_program_that_hangs_is_given_up() -> None:
     started = time.perf_counter()
-    assert sensors.output("sleep", "30", seconds=0.1) is None
+    assert device.output("sleep", "30", seconds=0.1) is None
     assert time.perf_counter() - started < 5
 
 

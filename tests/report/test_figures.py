@@ -6,6 +6,9 @@ import pytest
 from places import TRACES
 
 import lae_sim
+from lae_sim.evaluation.evaluate import evaluate_runs
+from lae_sim.evaluation.pairing import pair
+from lae_sim.evaluation.totals import CurveTotals
 from lae_sim.report import figures as plots
 from lae_sim.report.style import save
 
@@ -13,8 +16,13 @@ FORECASTERS = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
 
 
 def curves_of(trace):
-    evaluation = lae_sim.evaluate(lae_sim.replay_trace(trace), trace.metadata, FORECASTERS)
-    return plots.mean_curves(evaluation, FORECASTERS)
+    return curves_in(evaluate_runs(lae_sim.replay_trace(trace), trace.metadata, FORECASTERS))
+
+
+def curves_in(evaluation):
+    totals = CurveTotals()
+    totals.add(evaluation)
+    return plots.mean_curves(totals, list(FORECASTERS))
 
 
 @pytest.fixture
@@ -24,8 +32,8 @@ def trace():
 
 def test_curves_average_to_the_scores(trace):
     runs = list(lae_sim.replay_trace(trace))
-    found = lae_sim.evaluate(runs, trace.metadata, FORECASTERS, [Fraction(1, 2)])
-    curves = plots.mean_curves(found, FORECASTERS)
+    found = evaluate_runs(runs, trace.metadata, FORECASTERS, [Fraction(1, 2)])
+    curves = curves_in(found)
     assert list(curves) == ["offline", "hold", "kalman"]
     assert curves["offline"][0].mean() == pytest.approx(found.offline["auc"].mean())
     for f, name in enumerate(FORECASTERS):
@@ -55,7 +63,7 @@ def test_timeline_shows_frames_and_who_answers_them(trace):
     figure = plots.timeline(run, first=20, count=10)
     [axes] = figure.axes
     written = [text.get_text() for text in axes.texts]
-    pairing = lae_sim.pair([run.schedule], [Fraction(0)])
+    pairing = pair([run.schedule], [Fraction(0)])
     spans = zip(pairing.frames, pairing.first[:, 0], pairing.end[:, 0])
     source = {i: j for j, first, end in spans for i in range(first, end)}
     answers = [text for text in axes.texts if getattr(text, "xy", (0, 0))[1] == -0.4]
@@ -84,10 +92,10 @@ def test_curves_leave_out_the_sequences_that_the_scores_do(name):
     ]
     trace = lae_sim.Trace(lae_sim.Metadata.new("30", "every-frame"), recordings)
     convention = lae_sim.CONVENTIONS[name]
-    found = lae_sim.evaluate(
+    found = evaluate_runs(
         lae_sim.replay_trace(trace), trace.metadata, FORECASTERS, convention=convention
     )
-    curves = plots.mean_curves(found, FORECASTERS)
+    curves = curves_in(found)
     for f, forecaster in enumerate(FORECASTERS):
         success, precision = curves[forecaster]
         assert success.mean() == pytest.approx(np.nanmean(found.scores["auc"][f]))

@@ -20,7 +20,7 @@ from lae_sim.report import study_figures
 from lae_sim.report.page import convention_in_words, page, page_file, write_report
 from lae_sim.report.study_view import View
 from lae_sim.study.records import Failure
-from lae_sim.study.run import run_study
+from lae_sim.study.run import compute_study
 from lae_sim.study.spec import Study
 
 VOID = {"meta", "img", "br"}
@@ -63,7 +63,7 @@ def results(tmp_path_factory):
         sigmas=(Fraction(0), Fraction(1, 2)),
         require_auc=Fraction(1, 2),
     )
-    found = run_study(study, folder / "results", workers=1)
+    found = compute_study(study, folder / "results", workers=1)
     failure = Failure(f"three {NASTY}", NASTY)
     return dataclasses.replace(found, failures=(failure,))
 
@@ -134,7 +134,7 @@ def test_what_is_left_out_is_said(html):
 def test_a_study_of_one_trace_and_hold_alone_is_the_same_bytes_twice(tmp_path):
     [path, _] = nasty_traces(tmp_path)
     study = Study((path,), forecasters=("hold",), attributes=False)
-    results = run_study(study, tmp_path / "results", workers=1)
+    results = compute_study(study, tmp_path / "results", workers=1)
     text = page(View(results))
     ids = [attrs["id"] for _, attrs in Checker(text).found if "id" in attrs]
     assert ids == [

@@ -17,7 +17,7 @@ from lae_sim.report.study_tables import (
 )
 from lae_sim.report.study_view import View
 from lae_sim.report.table import Cell, Column, Table, latex_of, tex
-from lae_sim.study.run import StudyResults, run_study
+from lae_sim.study.run import StudyResults, compute_study
 from lae_sim.study.spec import Study
 
 
@@ -29,7 +29,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> StudyResults:
         scales=(Fraction(1, 2), Fraction(1), Fraction(2)),
         require_auc=Fraction(1, 2),
     )
-    return run_study(study, folder / "results", workers=1)
+    return compute_study(study, folder / "results", workers=1)
 
 
 def test_ranking_says_what_the_summary_says(results):

@@ -15,6 +15,8 @@ from places import REPOSITORY
 from trace_processor import queried
 
 import lae_sim
+from lae_sim.engine.clock import Clock
+from lae_sim.engine.policies import every, fifo, latest
 from lae_sim.evaluation.evaluate import evaluate_groups
 from lae_sim.report.timeline import timeline_file, trace_events
 
@@ -64,11 +66,11 @@ SCHEMA = {
 }
 
 
-def run(times_ms=(150, 100, 40, 40), fps=10, policy=lae_sim.latest):
+def run(times_ms=(150, 100, 40, 40), fps=10, policy=latest):
     boxes = np.zeros((len(times_ms), 4))
     elapsed = np.array(times_ms) * 1_000_000
     recording = lae_sim.Recording.new("sequence", boxes, boxes, elapsed)
-    return lae_sim.replay_sequence(recording, lae_sim.Clock.at(Fraction(fps)), policy=policy)
+    return lae_sim.replay_sequence(recording, Clock.at(Fraction(fps)), policy=policy)
 
 
 def tracks(events):
@@ -124,7 +126,7 @@ def test_a_declared_cost_delays_the_answers_of_its_forecaster_alone():
     times=st.lists(st.integers(0, 400), min_size=1, max_size=12),
     fps=st.sampled_from(["10", "29.97", "30000/1001", "240"]),
     sigma=st.fractions(-3, 3, max_denominator=50),
-    policy=st.sampled_from([lae_sim.latest, lae_sim.fifo, lae_sim.every(2)]),
+    policy=st.sampled_from([latest, fifo, every(2)]),
 )
 def test_the_tracks_are_the_schedule_and_the_event_log(times, fps, sigma, policy):
     replayed = run(times, fps, policy)

@@ -13,7 +13,7 @@ from places import REPOSITORY
 from lae_sim.comparison.statistics import Difference, Interval, Recovered
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.records import Failure, Staleness, SummaryRow, Uncertainty
-from lae_sim.study.run import run_study, write_csv
+from lae_sim.study.run import compute_study, write_csv
 from lae_sim.study.spec import Study
 from lae_sim.study.summary import _front, _median_survival
 
@@ -107,7 +107,7 @@ def test_records_hold_what_the_files_say(tmp_path):
         sigmas=SIGMA_GRID,
         require_auc=Fraction(1, 2),
     )
-    results = run_study(study, tmp_path, workers=1)
+    results = compute_study(study, tmp_path, workers=1)
     rows = {(row.trace, row.forecaster, row.sigma): row for row in results.summary}
     kalman = rows["synthetic-slow", "kalman", "mean"]
     uncertainty = kalman.uncertainty["auc"]

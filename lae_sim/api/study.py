@@ -1,0 +1,89 @@
+"""Running a study in one call."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lae_sim.errors import LaeError
+from lae_sim.progress import ProgressBar
+from lae_sim.report.page import write_report
+from lae_sim.report.study_tables import write_tables
+from lae_sim.report.study_view import View
+from lae_sim.study.run import StudyResults, compute_study
+from lae_sim.study.spec import Study, read_study
+
+
+def run_study(
+    study: Study | str | os.PathLike[str] | Mapping[str, Any] | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    report: bool = True,
+    progress: bool | None = None,
+    **keys: Any,
+) -> StudyResults:
+    """Replay and score many traces in many worlds, or go on where an earlier run stopped.
+
+    Args:
+        study: a study, the path of a TOML file, or a mapping of its keys; or give the keys
+            themselves, such as ``traces="*.parquet", latencies=["recorded", "bootstrap"]``.
+        folder: where results are kept; of a file ``STUDY-results``, else ``study-results``.
+            Finished parts found there are not computed again.
+        workers: processes on this machine; by default one for each core. No result depends on it.
+        scheduler: address of a Dask cluster to compute on instead.
+        report: whether to write ``report.html`` and ``tables/`` too.
+        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        keys: keys of the study file (see :class:`Study`).
+
+    Raises:
+        LaeError: if a key is unknown or a value impossible, a trace is missing, or nothing could be
+            computed; it says which.
+
+    Example:
+        >>> import tempfile
+        >>> import lae_sim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     results = lae_sim.run_study(
+        ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
+        ...     )
+        >>> [(row.forecaster, round(row.auc, 4)) for row in results.summary]
+        [('hold', 0.5722), ('kalman', 0.6291)]
+    """
+    base, kept = None, folder or "study-results"
+    if study is None:
+        made = Study.of(keys)
+    elif keys:
+        raise LaeError(f"{next(iter(keys))}: give a study, or its keys, not both")
+    elif isinstance(study, Study):
+        made = study
+    elif isinstance(study, Mapping):
+        made = Study.of(study)
+    else:
+        path = Path(study)
+        made, base, kept = read_study(str(path)), path.parent, folder or f"{path.stem}-results"
+    if workers is not None and scheduler is not None:
+        raise LaeError("--scheduler says where to compute: --workers is for this machine")
+    with ProgressBar("study", "tasks", progress) as bar:
+
+        def advance(what: str, done: int, total: int) -> None:
+            bar(done, total, what)
+
+        results = compute_study(made, kept, base, workers, scheduler, advance)
+    write_views(results, report)
+    return results
+
+
+def write_views(results: StudyResults, report: bool = True) -> None:
+    """Write the report and the tables of a study beside its results, or take old ones away."""
+    page, tables = results.folder / "report.html", results.folder / "tables"
+    if report:
+        view = View(results)
+        write_tables(view, tables)
+        write_report(view, page)
+        return
+    for path in (page, *tables.glob("*.*")):
+        path.unlink(missing_ok=True)  # it would be of other results

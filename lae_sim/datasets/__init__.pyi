@@ -1,0 +1,16 @@
+from .annotations import GroundTruth, find_truth, read_attributes, read_truth
+from .frames import Dataset, Image, ImageSequence
+from .layouts import find_dataset
+from .synthetic import synthetic_dataset
+
+__all__ = [
+    "Dataset",
+    "GroundTruth",
+    "Image",
+    "ImageSequence",
+    "find_dataset",
+    "find_truth",
+    "read_attributes",
+    "read_truth",
+    "synthetic_dataset",
+]

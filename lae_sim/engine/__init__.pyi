@@ -1,0 +1,31 @@
+from .clock import Clock, Number, duration_ns, exact, parse_duration, parse_fps, parse_rational
+from .lanes import batchable, simulate_lanes
+from .policies import LanePolicy, every, fifo, latest, listed, shrinking_tail, vot_realtime
+from .scheduler import Call, Policy, Schedule, Service, scores_latency, simulate
+from .times import Times
+
+__all__ = [
+    "Call",
+    "Clock",
+    "LanePolicy",
+    "Number",
+    "Policy",
+    "Schedule",
+    "Service",
+    "Times",
+    "batchable",
+    "duration_ns",
+    "every",
+    "exact",
+    "fifo",
+    "latest",
+    "listed",
+    "parse_duration",
+    "parse_fps",
+    "parse_rational",
+    "scores_latency",
+    "shrinking_tail",
+    "simulate",
+    "simulate_lanes",
+    "vot_realtime",
+]

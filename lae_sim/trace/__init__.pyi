@@ -1,0 +1,16 @@
+from .file import Trace, held, read_trace, validate, write_trace
+from .locate import find_traces
+from .metadata import Metadata
+from .recording import Recording, batched
+
+__all__ = [
+    "Metadata",
+    "Recording",
+    "Trace",
+    "batched",
+    "find_traces",
+    "held",
+    "read_trace",
+    "validate",
+    "write_trace",
+]
