@@ -22,8 +22,7 @@ import simpy
 from filterpy.kalman import KalmanFilter
 
 from lae_sim import Metadata, Recording, Trace, simulate, write_trace
-from lae_sim.engine.clock import Clock
-from lae_sim.engine.policies import latest
+from lae_sim.engine import Clock, latest
 from lae_sim.forecast.base import ForecasterFactory, Lanes, defines, forecast
 from lae_sim.learning.folds import Examples
 from lae_sim.learning.registry import load_forecaster
@@ -264,14 +263,14 @@ def process(*arguments: str) -> Callable[[], object]:
 
 def process_lines(trace: str, rounds: int) -> list[list[str]]:
     """Whole processes, imports included, against reading the file."""
-    grid = ("-m", "lae_sim.cli.replay", trace, "--sigma-grid", "--json", "--forecaster")
+    grid = ("-m", "lae_sim.replay", trace, "--sigma-grid", "--json", "--forecaster")
     works = {
         "read the Parquet file": process("-c", READ, trace),
         "sigma = 0, hold": process(*grid[:3], "--json", "--forecaster", "hold"),
         "51 sigmas, hold": process(*grid, "hold"),
         "51 sigmas, hold + kalman": process(*grid, "hold", "kalman"),
         "51 sigmas, hold + kalman-lae-pvt": process(*grid, "hold", "kalman-lae-pvt"),
-        "--help": process("-m", "lae_sim.cli.replay", "--help"),
+        "--help": process("-m", "lae_sim.replay", "--help"),
     }
     targets = {"51 sigmas, hold": 1.0, "51 sigmas, hold + kalman": 2.0, "--help": 0.3}
     found = medians(works, rounds)
