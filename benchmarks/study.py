@@ -24,13 +24,11 @@ from statistics import median
 import numpy as np
 from run import CLOCK, FRAMES, lengths, medians, recordings
 
-from lae_sim import Metadata, Recording, Trace, latest, simulate, write_trace
-from lae_sim.engine.lanes import simulate_lanes
-from lae_sim.engine.times import Times
-from lae_sim.evaluation.evaluate import evaluate_groups
-from lae_sim.forecast.base import Hold
-from lae_sim.replay.latency import bootstrap
-from lae_sim.replay.run import replay_repeated
+from lae_sim import Metadata, Recording, Trace, replay_trace, simulate, write_trace
+from lae_sim.engine import Times, latest, simulate_lanes
+from lae_sim.evaluation import evaluate_groups
+from lae_sim.forecast import Hold
+from lae_sim.replay import bootstrap, replay_repeated
 from lae_sim.report.table import aligned
 
 RATES = (15, 20, 25, 30, 40, 50, 60, 90)  # frames/s of the trackers
@@ -126,7 +124,7 @@ def study(
         with tempfile.TemporaryDirectory(dir=folder) as out:
             where = str(Path(out) / str(next(number)))
             return process(
-                "-m", "lae_sim.cli.study", str(file), "--no-report", "--out", where, *options
+                "-m", "lae_sim", "study", str(file), "--no-report", "--out", where, *options
             )
 
     return work
@@ -197,6 +195,7 @@ def lane_lines(rounds: int) -> list[list[str]]:
     metadata = Metadata.new("30", "every-frame")
     trace = Trace(metadata, list(recordings(lengths())))
     source = bootstrap(0)
+    drawn = replay_trace(trace, latency=source)
     every = [
         Times(recording.name, ns, by_call=True)
         for recording in trace
@@ -211,10 +210,10 @@ def lane_lines(rounds: int) -> list[list[str]]:
             simulate(size, CLOCK, replace(times), latest)
 
     def runs() -> Iterator[tuple[int, object]]:
-        return replay_repeated(trace, source, REPETITIONS)
+        return replay_repeated(drawn, REPETITIONS)
 
     def scored() -> None:
-        those = (run for _, run in replay_repeated(trace, source, REPETITIONS))
+        those = (run for _, run in replay_repeated(drawn, REPETITIONS))
         for _ in evaluate_groups(those, metadata, {"hold": Hold}, (Fraction(0),), frames=1 << 17):
             pass
 

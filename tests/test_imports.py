@@ -116,7 +116,7 @@ runs = [replay_sequence(r, Clock.at(trace.metadata.fps)) for r in trace]
 evaluate_runs(runs, trace.metadata, {"kalman": load_forecaster("kalman")})
 """
 
-HEAVY = {"pandas", "torch", "cv2", "matplotlib", "scipy", "filterpy", "IPython"}
+HEAVY = {"pandas", "torch", "cv2", "matplotlib", "jinja2", "scipy", "filterpy", "IPython"}
 
 
 @pytest.mark.parametrize("program", ["import lae_sim", READ, READ + EVALUATE], ids=range(3))

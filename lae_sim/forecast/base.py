@@ -19,7 +19,7 @@ box. A factory may have a second form for many sequences and permitted latencies
     windows             lanes; streaming is a lane of as many outputs as the rule looks at
     kalman              one update that works on one filter and on n of them in step
     g-h, imm, oracle    streaming
-    camera+NAME         both: over lanes all frames are mapped at once, 25 times as fast, while
+    camera+NAME         both: over lanes all frames are mapped at once, 30 times as fast, while
                         streaming by a lane would ask for all outputs so far at every frame
 """
 

@@ -231,7 +231,16 @@ class CameraCompensated:
 
 
 def _outlooks(transforms: Floats, lag: int) -> Complexes:
-    """The map from frame 0 to frame k + d as known at k, complex128 [lag + 1 (d), T (k), 2]."""
+    """The map from frame 0 to frame k + d as known at k, complex128 [lag + 1 (d), T (k), 2].
+
+    With a lag of 2, the motion up to frame 5 is known at frame 7 at the latest, and a forecast for
+    frame 7 made on the output of frame 5 is read at d = 2, k = 5:
+
+        k        0    1    2    3    4    5  ...
+        d = 0    0    1    2    3    4    5       as estimated
+        d = 1    1    2    3    4    5    6       one mean step beyond
+        d = 2    2    3    4    5    6    7       two
+    """
     steps = transforms[:, 0, [0, 2]] + 1j * transforms[:, 1, [0, 2]]
     velocity = steps.copy()
     outlooks = np.empty((lag + 1, *steps.shape), np.complex128)

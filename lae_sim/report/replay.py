@@ -24,9 +24,8 @@ from lae_sim.report.table import (
     PERCENT,
     Column,
     Number,
-    Table,
     relative_change,
-    text_of,
+    text_of_records,
 )
 from lae_sim.trace.metadata import Metadata
 
@@ -236,7 +235,7 @@ def _text(
         Column("forecaster", "forecaster", is_label=True),
         *(Column(SWEPT[key], key) for key in swept),
     ]
-    return text_of(Table.of([*labels, *columns], lines))
+    return text_of_records([*labels, *columns], lines)
 
 
 def summary_table(
@@ -344,9 +343,11 @@ def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequenc
         Column("approximate", "approximate_outputs"),
         Column("disagree", "disagreement", PERCENT),
     ]
-    lines = [
-        line.new_child({**scores, "label": scores["sequence"]})
-        for line in _lines([("", report)], shown_sigmas)
-        for scores in line["per_sequence"]
-    ]
-    return _text(columns, sorted(lines, key=itemgetter("label")), "sequence", swept)
+    lines = list(_lines([("", report)], shown_sigmas))
+    by_sequence = zip(*(line["per_sequence"] for line in lines))
+    records = (
+        ChainMap({"label": scores["sequence"]}, scores, *line.maps)
+        for rows in by_sequence
+        for line, scores in zip(lines, rows)
+    )
+    return _text(columns, records, "sequence", swept)

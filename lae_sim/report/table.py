@@ -190,6 +190,13 @@ def text_of(table: Table, intervals: Container[str] | None = None) -> str:
     return aligned(table.header, lines, table.labels)
 
 
+def text_of_records(columns: Sequence[Column], records: Iterable[Any]) -> str:
+    """The text of the table of these records, of which no more is kept than their texts."""
+    lines = [[column.cell(record).text for column in columns] for record in records]
+    labels = sum(column.is_label for column in columns)
+    return aligned([column.title for column in columns], lines, labels)
+
+
 def legend_of(table: Table) -> str:
     """What the columns mean, in lines that fit a terminal."""
     parts = [f"{column.title}: {column.meaning}" for column in table.columns if column.meaning]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -9,11 +12,12 @@ import pytest
 from witness import moving
 
 from lae_sim.engine.clock import Clock
-from lae_sim.evaluation.evaluate import evaluate, evaluate_groups
+from lae_sim.evaluation.evaluate import evaluate_groups, evaluate_runs
 from lae_sim.evaluation.metrics import CONVENTIONS, METRICS
 from lae_sim.evaluation.totals import RECOVERED, Mean, Totals
 from lae_sim.forecast.base import ConstantVelocity, Hold
-from lae_sim.replay.run import replay_sequence
+from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
@@ -40,7 +44,7 @@ def test_totals_of_groups_are_the_means_of_all(name: str, frames: int) -> None:
     for part in evaluate_groups(runs, EVERY, FORECASTERS, SIGMAS, convention, frames=frames):
         members = [i for i, name in enumerate(part.replay.sequences) if name in ("s1", "s4", "s7")]
         totals.add(part, {"some": members} if members else {})
-    whole = evaluate(runs, EVERY, FORECASTERS, SIGMAS, convention)
+    whole = evaluate_runs(runs, EVERY, FORECASTERS, SIGMAS, convention)
     for scores, which in (
         (totals.scores, list(range(8))),
         (totals.by_attribute["some"], [1, 4, 7]),
@@ -105,3 +109,24 @@ def test_a_mean_of_nothing_is_nan() -> None:
     mean.add(np.array([[np.nan, np.nan], [1, np.nan]]))
     mean.add(np.array([[np.nan], [3.0]]))
     np.testing.assert_array_equal(mean.value, [np.nan, 2])
+
+
+def test_what_is_kept_of_a_sequence_does_not_grow_with_sigmas_or_thresholds() -> None:
+    run = replay_sequence(moving(3), CLOCK)
+    count = 4000
+
+    def runs() -> Iterator[Run]:
+        for index in range(count):
+            recording = replace(run.recording, name=f"s{index:06}")
+            yield replace(run, recording=recording)
+
+    totals = Totals(hold=1)
+    tracemalloc.start()
+    for part in evaluate_groups(runs(), EVERY, FORECASTERS, SIGMA_GRID, frames=1500):
+        totals.add(part)
+    del part
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(totals.replay.sequences) == count
+    # its name and ten numbers; the scores alone would be 3,264 bytes, the curves 1,728
+    assert kept / count < 300

@@ -8,6 +8,7 @@ from fractions import Fraction
 import pytest
 from nasty import nasty_traces
 
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.study_tables import (
     comparison_table,
     ranking,
@@ -17,6 +18,7 @@ from lae_sim.report.study_tables import (
 )
 from lae_sim.report.study_view import View
 from lae_sim.report.table import Cell, Column, Table, latex_of, tex
+from lae_sim.study.records import MEAN
 from lae_sim.study.run import StudyResults, compute_study
 from lae_sim.study.spec import Study
 
@@ -83,6 +85,15 @@ def test_pairs_and_requirements(results):
     rows = required_table(view).rows
     assert [row[0].value for row in rows] == ["one", "one", "two", "two"]
     assert [row[2].value for row in rows] == [0.5] * 4
+
+
+def test_a_mean_over_sigma_shows_no_interval_of_a_single_one(tmp_path):
+    study = Study(tuple(nasty_traces(tmp_path)), sigmas=SIGMA_GRID, attributes=False)
+    results = compute_study(study, tmp_path / "results", workers=1)
+    rows = View(results).rows
+    means = [row for row in results.summary if row.sigma == MEAN]
+    assert [row.uncertainty for row in rows] == [row.uncertainty for row in means]
+    assert all(row.staleness is not None for row in rows)  # that is of the first sigma
 
 
 def test_files(results, tmp_path):

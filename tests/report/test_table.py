@@ -1,0 +1,97 @@
+"""One table, four ways to show it: that they say the same, and what a column makes of a record."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from lae_sim.report.table import (
+    PERCENT,
+    SCORE,
+    SIGNED,
+    UNKNOWN,
+    Cell,
+    Column,
+    Number,
+    Table,
+    latex_of,
+    legend_of,
+    p_label,
+    relative_change,
+    text_of,
+    write_csv,
+)
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """A record for the tables here."""
+
+    name: str
+    auc: float | None
+    auc_low: float | None = None
+    auc_high: float | None = None
+
+
+RECORDS = [Tracker("slow\n", 0.51249, 0.4, 0.6), Tracker("fast & rough", None)]
+COLUMNS = [
+    Column("tracker", "name", is_label=True),
+    Column("AUC", "auc", SCORE, "mean over sequences"),
+    Column("lost", lambda tracker: relative_change(tracker.auc, 1.0), PERCENT),
+]
+TABLE = Table.of(COLUMNS, RECORDS, "t", "What there is")
+
+
+@pytest.mark.parametrize("records", [RECORDS, [vars(record) for record in RECORDS]])
+def test_a_column_reads_records_and_mappings(records: list[Tracker]) -> None:
+    first, second = Table.of(COLUMNS[:2], records).rows
+    assert first == (
+        Cell("slow ", "slow\n"),
+        Cell("0.512 [0.400, 0.600]", 0.51249, (0.4, 0.6)),
+    )
+    assert second == (Cell("fast & rough", "fast & rough"), UNKNOWN)
+
+
+def test_text_is_aligned_and_leaves_intervals_out_if_asked() -> None:
+    assert text_of(TABLE).splitlines() == [
+        "tracker                        AUC    lost",
+        "------------  --------------------  ------",
+        "slow          0.512 [0.400, 0.600]  -48.8%",
+        "fast & rough                     -       -",
+    ]
+    assert text_of(TABLE, intervals=()).splitlines()[2] == "slow          0.512  -48.8%"
+    assert legend_of(TABLE) == "AUC: mean over sequences"
+
+
+def test_csv_has_numbers_in_full(tmp_path: Path) -> None:
+    write_csv(TABLE, tmp_path / "t.csv")
+    with open(tmp_path / "t.csv", newline="") as file:
+        header, first, second = csv.reader(file)
+    assert header == ["tracker", "AUC", "AUC low", "AUC high", "lost"]
+    assert first == ["slow\n", "0.51249", "0.4", "0.6", str(0.51249 - 1)]
+    assert second == ["fast & rough", "", "", "", ""]
+
+
+def test_latex_escapes_names_and_signs() -> None:
+    lines = latex_of(TABLE).splitlines()
+    assert lines[0] == "% What there is"
+    assert r"slow  & 0.512 {[}0.400, 0.600] & $-$48.8\% \\" in lines
+    assert r"fast \& rough & -- & -- \\" in lines
+
+
+def test_groups_stand_above_their_columns() -> None:
+    columns = [Column("a", "auc", is_label=True)]
+    columns += [Column(t, "auc", group=g) for g in ("one", "two") for t in ("x", "y")]
+    assert Table.of(columns, []).groups == [("one", 2), ("two", 2)]
+
+
+def test_numbers() -> None:
+    assert [SIGNED(0.5), SCORE(None), SCORE(float("nan"))] == ["+0.500", "-", "-"]
+    share = Number(".1f", 100, "%", ".0f")
+    assert share(0.123, (0.1, 0.2)) == "12.3% [10, 20]"
+    assert [p_label(0.0004), p_label(0.0126), p_label(None)] == ["<0.001", "0.013", "-"]
+    assert relative_change(1.0, None) is None
+    assert relative_change(1.0, 0.0) is None
