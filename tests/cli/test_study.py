@@ -22,7 +22,7 @@ from places import REPOSITORY
 
 import lae_sim
 from lae_sim.cli.study import main
-from lae_sim.comparison.forecasters import compare_forecasters
+from lae_sim.comparison.forecasters import score_forecasters
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.learning.trainers import KalmanTrainer
@@ -116,7 +116,7 @@ def test_every_row_is_what_replaying_and_scoring_one_by_one_gives(tmp_path: Path
     results = run(
         tmp_path, scales=scales, sigmas=sigmas, latencies=latencies, repetitions=3, seed=5, block=7
     )
-    table = results.table().set_index(
+    table = results.to_frame().set_index(
         ["trace", "latency", "scale", "forecaster", "repetition", "sequence", "sigma"]
     )
     assert len(table) == 2 * 5 * 2 * 2 * 3 * 2
@@ -201,7 +201,7 @@ def test_repetitions_are_dealt_out_in_chunks_that_change_nothing(
     parts = run(tmp_path / "b", **more)
     assert len(parts.plan.cells) == 3 * len(whole.plan.cells)
     keys = ["trace", "forecaster", "repetition", "sequence"]
-    tables = [r.table().sort_values(keys, ignore_index=True) for r in (whole, parts)]
+    tables = [r.to_frame().sort_values(keys, ignore_index=True) for r in (whole, parts)]
     pd.testing.assert_frame_equal(*tables)
     assert whole.summary == parts.summary
     assert whole.comparisons == parts.comparisons
@@ -212,7 +212,7 @@ def test_jitter_has_its_own_interval_and_probability(tmp_path: Path) -> None:
     rows = {(row["trace"], row["latency"]): row
             for row in results.summary if row["forecaster"] == "hold"}  # fmt: skip
     drawn = rows["synthetic-slow", "bootstrap"]
-    table = results.table().query(
+    table = results.to_frame().query(
         "trace == 'synthetic-slow' and latency == 'bootstrap' and forecaster == 'hold'"
     )
     means = table.groupby("repetition")["auc"].mean()
@@ -222,7 +222,7 @@ def test_jitter_has_its_own_interval_and_probability(tmp_path: Path) -> None:
     assert "auc_jitter_low" not in rows["synthetic-slow", "recorded"]
     for pair in results.comparisons:
         a, b = (
-            results.table()
+            results.to_frame()
             .query(f"trace == '{name}' and latency == '{pair['latency']}'")
             .query(f"forecaster == '{pair['forecaster']}'")
             .groupby("repetition")["auc"].mean().to_numpy()
@@ -317,7 +317,7 @@ def test_only_what_is_missing_or_changed_is_computed(tmp_path: Path) -> None:
     more = Study((str(mine), str(FAST)), sequences=FEW, forecasters=("hold", "constant-velocity"))
     changed = run(out, more)  # kalman is set aside
     assert changed.computed == 2
-    assert set(changed.table()["forecaster"]) == {"hold", "constant-velocity"}
+    assert set(changed.to_frame()["forecaster"]) == {"hold", "constant-velocity"}
     assert set(pd.read_parquet(out / "results")["forecaster"]) == {"hold", "constant-velocity"}
     assert run(out, study).computed == 0  # and taken back
     assert set(pd.read_parquet(out / "results")["forecaster"]) == {"hold", "kalman"}
@@ -355,11 +355,11 @@ def test_what_is_trained_is_not_trained_again(
     results = run(tmp_path, study)
     notes = results.notes()
     assert any("trained in 5 folds over 8 sequences" in note for note in notes)
-    table = compare_forecasters(
+    table = score_forecasters(
         {"slow": lae_sim.read_trace(SLOW)}, {"tuned-kalman": KalmanTrainer()}
     )
     scores = table.query("forecaster == 'tuned-kalman' and metric == 'auc'").set_index("sequence")
-    found = results.table().query("forecaster == 'tuned-kalman'").set_index("sequence")
+    found = results.to_frame().query("forecaster == 'tuned-kalman'").set_index("sequence")
     assert found["auc"].to_dict() == scores["value"].to_dict()
     monkeypatch.setattr("lae_sim.study.plan.fitted", None)
     again = run(tmp_path, study)
@@ -593,5 +593,5 @@ def test_a_damaged_cell_says_what_to_do(tmp_path: Path) -> None:
 
 
 def test_the_columns_are_those_that_are_documented(tmp_path: Path) -> None:
-    table = run(tmp_path).table()
+    table = run(tmp_path).to_frame()
     assert list(table) == list(cell_rows.COLUMNS)
