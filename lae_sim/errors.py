@@ -9,11 +9,29 @@ from contextlib import contextmanager
 
 
 class LaeError(Exception):
-    """An input or a setting that cannot be used; the message says where and what to do."""
+    """An input or a setting that cannot be used; the message says where and what to do.
+
+    Example:
+        >>> import lae_sim
+        >>> try:
+        ...     lae_sim.evaluate("traces/synthetic-slow.parquet", latency="constant:47")
+        ... except lae_sim.LaeError as error:
+        ...     print(error)
+        latency: '47' is not a duration: write it with its unit, such as 47ms
+    """
 
 
 class TraceError(LaeError):
-    """A trace that is missing, damaged, or breaks the format (see ``traces/FORMAT.md``)."""
+    """A trace that is missing, damaged, or breaks the format (see ``traces/FORMAT.md``).
+
+    Example:
+        >>> import lae_sim
+        >>> try:
+        ...     lae_sim.read_trace("nowhere.parquet")
+        ... except lae_sim.TraceError as error:
+        ...     print(error)
+        nowhere.parquet: no such file
+    """
 
 
 @contextmanager

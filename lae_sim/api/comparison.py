@@ -46,6 +46,17 @@ class ComparisonResult:
         scores: the tidy table of :func:`lae_sim.comparison.forecasters.score_forecasters`.
         whole_grid: whether the scores are compared as means over the whole grid of sigmas.
         seed: of the bootstrap.
+
+    Example:
+        >>> import lae_sim
+        >>> result = lae_sim.compare_forecasters(
+        ...     "traces/synthetic-slow.parquet", forecasters=["kalman", "least-squares"]
+        ... )
+        >>> table = result.summary.query("metric == 'auc'").set_index("forecaster")
+        >>> table["mean"].round(4).to_dict()
+        {'hold': 0.5722, 'kalman': 0.6291, 'least-squares': 0.6375, 'offline': 0.7773}
+        >>> result.plot()
+        <Figure ...>
     """
 
     traces: Mapping[str, Trace]

@@ -224,6 +224,22 @@ class EvaluationResult:
 
     Attributes:
         parts: one per trace and world.
+
+    Example:
+        >>> import lae_sim
+        >>> result = lae_sim.evaluate("traces/synthetic-slow.parquet", scale=[1, 2])
+        >>> result.summary[["scale", "forecaster", "auc", "recovered_auc"]].round(3)
+           scale forecaster    auc  recovered_auc
+        0    1.0       hold  0.572            NaN
+        1    1.0     kalman  0.629          0.278
+        2    2.0       hold  0.439            NaN
+        3    2.0     kalman  0.501          0.182
+        >>> result.answers("boat-calm", "kalman")[["frame", "source_frame", "iou"]].round(3).tail(2)
+             frame  source_frame    iou
+        298    298           296  0.936
+        299    299           297  0.908
+        >>> result.plot()
+        <Figure ...>
     """
 
     parts: tuple[Evaluated, ...]

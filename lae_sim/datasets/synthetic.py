@@ -101,9 +101,9 @@ def synthetic_dataset(seed: int = 0) -> Dataset:
 
     Example:
         >>> import lae_sim
-        >>> race = lae_sim.synthetic_dataset().sequences[9]
+        >>> race = lae_sim.synthetic_dataset().sequences[7]
         >>> race.name, len(race), race.truth[0].round().tolist()
-        XX
+        ('race', 160, [362.0, 139.0, 29.0, 55.0])
     """
     if type(seed) is not int or seed < 0:
         raise LaeError(f"seed: a whole number from 0, not {shown(seed)}")

@@ -85,7 +85,7 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
         >>> from lae_sim.engine import Clock, latest
         >>> schedule = lae_sim.simulate(9, Clock.at(30), lambda frame: 47_000_000, latest)
         >>> schedule.frames.tolist()
-        XX
+        [0, 1, 2, 4, 5, 7, 8]
     """
     import simpy
 

@@ -217,7 +217,7 @@ def evaluate_runs(
         >>> makers = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
         >>> scores = lae_sim.evaluate_runs(runs, runs.trace.metadata, makers).scores["auc"]
         >>> scores.shape, scores.mean(axis=(1, 2)).round(4).tolist()
-        XX
+        ((2, 8, 1), [0.5791, 0.6414])
     """
     if isinstance(runs, (str, os.PathLike, Trace)):
         raise LaeError(f"runs: what replay_trace gives, not {shown(runs)}; evaluate takes traces")

@@ -79,6 +79,15 @@ CONVENTIONS = {
         Convention("exclude", "size", leaves_out=True),
     )
 }
+"""How frames and thresholds count, by the names that arguments take.
+
+Example:
+    >>> import lae_sim
+    >>> list(lae_sim.CONVENTIONS)
+    ['pysot', 'elae', 'otb', 'got10k', 'got10k-101', 'exclude']
+    >>> lae_sim.CONVENTIONS["got10k"].leaves_out
+    True
+"""
 
 
 PYSOT = CONVENTIONS["pysot"]

@@ -56,6 +56,13 @@ def load_forecaster(name: str, camera: Camera | None = None) -> AnyFactory:
     Raises:
         LaeError: if there is none of that name, it must be trained first, its options do not fit,
             or it cannot be imported.
+
+    Example:
+        >>> import lae_sim
+        >>> lae_sim.load_forecaster("kalman") is lae_sim.Kalman
+        True
+        >>> lae_sim.load_forecaster("kalman:q=3,decay=0.99")
+        TunedKalman(q=3, r=10.0, p0=100.0, decay=0.99, state='corner')
     """
     from lae_sim.learning.folds import Trainer
 

@@ -41,6 +41,13 @@ class Run:
         disagreement: share of processed frames where the box of the next lower or next higher
             stride overlaps less than half, 0 if the replay is exact, NaN without strided passes.
             Where it is high the tracker's luck depends on the frames that it sees.
+
+    Example:
+        >>> import lae_sim
+        >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
+        >>> run = next(iter(runs))
+        >>> run.recording.name, len(run), len(run.schedule.frames), run.departures
+        ('bike-pan', 300, 213, 86)
     """
 
     recording: Recording
@@ -85,7 +92,7 @@ def replay_sequence(
         >>> trace = lae_sim.read_trace("traces/synthetic-slow.parquet")
         >>> run = lae_sim.replay_sequence(trace["boat-calm"], Clock.at(trace.metadata.fps))
         >>> run.schedule.frames[:5].tolist(), run.boxes.shape == (len(run.schedule.frames), 4)
-        XX
+        ([0, 8, 9, 10, 12], True)
     """
     if not isinstance(recording, Recording):
         raise LaeError(f"recording: one sequence, such as trace['car'], not {shown(recording)}")
@@ -187,6 +194,14 @@ class Runs:
     Raises:
         LaeError: if two passes have the same stride; while one goes through the runs, if a
             sequence or frame that is asked for is not there, or policy or source raise something.
+
+    Example:
+        >>> import lae_sim
+        >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
+        >>> runs
+        <Runs of <Trace of 'slow-and-accurate' on 'synthetic': 8 sequences, 2,400 frames at 30 fps> at 30 fps>
+        >>> sum(len(run.schedule.frames) for run in runs) / runs.trace.frames
+        0.71
     """
 
     trace: Trace

@@ -24,7 +24,15 @@ from lae_sim.replay.run import Runs
 from lae_sim.trace.file import Trace, read_trace
 
 SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
-"""The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames."""
+"""The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames.
+
+Example:
+    >>> import lae_sim
+    >>> len(lae_sim.SIGMA_GRID), lae_sim.SIGMA_GRID[1]
+    (51, Fraction(1, 50))
+    >>> lae_sim.World.of(sigma="grid").sigmas == lae_sim.SIGMA_GRID
+    True
+"""
 
 TraceLike: TypeAlias = "str | os.PathLike[str] | Trace"
 """An open trace, or the path or URL of one."""
@@ -55,6 +63,15 @@ class World:
 
     Raises:
         LaeError: if a value is impossible, or some do not go together.
+
+    Example:
+        >>> import lae_sim
+        >>> world = lae_sim.World.of(fps="30000/1001", latency="constant:47ms", scale=1.5)
+        >>> world.fps, world.scale, world.label()
+        (Fraction(30000, 1001), Fraction(3, 2), 'constant:47ms x 3/2')
+        >>> runs = world.replay("traces/synthetic-slow.parquet")
+        >>> next(iter(runs)).schedule.frames[:4].tolist()
+        [0, 2, 4, 6]
     """
 
     fps: Fraction | None = None
@@ -233,7 +250,7 @@ def replay_trace(
         >>> import lae_sim
         >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
         >>> [len(run) for run in runs][:3]
-        [400, 400, 400]
+        [300, 300, 300]
     """
     opened = named("trace", open_trace, trace)
     world = World.of(

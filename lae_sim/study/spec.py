@@ -58,6 +58,15 @@ class Study:
         block: consecutive calls that the bootstrap of latencies keeps together.
         folds: of the training, where a forecaster is trained.
         require_auc: AUC for which the needed speed is looked for; None = not looked for.
+
+    Raises:
+        LaeError: if a value is impossible; it names the key of the file.
+
+    Example:
+        >>> import lae_sim
+        >>> study = lae_sim.Study(traces="traces/*.parquet", scales=[0.5, 1], sigmas="grid")
+        >>> study.traces, study.scales, len(study.sigmas)
+        (('traces/*.parquet',), (Fraction(1, 2), Fraction(1, 1)), 51)
     """
 
     traces: tuple[str, ...]
@@ -137,6 +146,12 @@ def read_study(path: str | os.PathLike[str]) -> Study:
 
     Raises:
         LaeError: if it cannot be read, is not TOML, or is no valid study.
+
+    Example:
+        >>> import lae_sim
+        >>> study = lae_sim.read_study("traces/study.toml")
+        >>> study.traces, study.latencies
+        (('synthetic-slow.parquet', 'synthetic-fast.parquet'), ('recorded', 'bootstrap'))
     """
     if sys.version_info >= (3, 11):
         import tomllib

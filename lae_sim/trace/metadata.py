@@ -28,6 +28,14 @@ class Metadata:
         fps: world frame rate, frames per second, exact.
         kind: ``"every-frame"`` or ``"real-time"``.
         document: the whole JSON object (see ``traces/FORMAT.md``).
+
+    Example:
+        >>> import lae_sim
+        >>> metadata = lae_sim.Metadata.new("30000/1001", "every-frame", tracker={"name": "mine"})
+        >>> metadata.fps, metadata.tracker, metadata.device
+        (Fraction(30000, 1001), 'mine', 'unknown')
+        >>> lae_sim.read_trace("traces/synthetic-slow.parquet").metadata.attributes("boat-calm")
+        ()
     """
 
     fps: Fraction

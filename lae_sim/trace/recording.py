@@ -24,6 +24,14 @@ class Recording:
         boxes: the tracker's boxes, float64 [T, 4]; NaN = frame not processed.
         elapsed_ns: processing times in ns, int64 [T]; -1 = frame not processed.
         score: the tracker's confidence, float32 [T]; NaN = none.
+
+    Example:
+        >>> import lae_sim
+        >>> truth = [[10, 20, 30, 40], [12, 20, 30, 40]]
+        >>> boxes = [[10, 20, 30, 40], [11, 20, 30, 40]]
+        >>> recording = lae_sim.Recording.new("car", truth, boxes, [5_000_000, 47_000_000])
+        >>> len(recording), recording.elapsed_ns.tolist()
+        (2, [5000000, 47000000])
     """
 
     name: str
