@@ -30,8 +30,6 @@ from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import TraceLike, World, label_of
-from lae_sim.report import figures
-from lae_sim.report.export import sigma_text
 from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
 from lae_sim.trace.file import Trace
 
@@ -438,6 +436,9 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
         sigma: the permitted latency of a sweep's scores; the first by default. Success and
             precision are at the first in any case.
     """
+    from lae_sim.report import figures
+    from lae_sim.report.export import sigma_text
+
     first = parts[0].scenario
     at = first.world.sigmas[0] if sigma is None else sigma
     traces = list(dict.fromkeys(part.scenario.label for part in parts))

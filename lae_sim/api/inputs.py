@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from lae_sim.errors import LaeError
 from lae_sim.files import labels
-from lae_sim.forecast.base import AnyFactory
-from lae_sim.learning.folds import Trainer
 from lae_sim.replay.world import TraceLike, open_trace, several
 from lae_sim.trace.file import Trace
 from lae_sim.trace.locate import find_traces
+
+if TYPE_CHECKING:
+    from lae_sim.forecast.base import AnyFactory
+    from lae_sim.learning.folds import Trainer
 
 Forecasters: TypeAlias = (
     "str | AnyFactory | Trainer | Iterable[str | AnyFactory | Trainer] | "
@@ -69,7 +71,7 @@ def forecaster_names(forecasters: Forecasters) -> tuple[tuple[str, ...], dict[st
     for each in several(forecasters):
         if isinstance(each, str):
             names.append(each)
-        elif callable(each) or isinstance(each, Trainer):
+        elif callable(each) or hasattr(each, "fit"):
             name = str(getattr(each, "__name__", type(each).__name__))
             names.append(name)
             objects[name] = each
