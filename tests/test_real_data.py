@@ -15,7 +15,7 @@ from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import by_frame, constant, scaled
 from lae_sim.replay.run import replay_sequence
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.study.run import compute_study
+from lae_sim.study.run import compute_study, flat_rows
 from lae_sim.study.spec import Study
 from lae_sim.trace.file import Trace, read_trace, write_trace
 from lae_sim.trace.metadata import Metadata
@@ -118,10 +118,12 @@ def test_studies_reach_the_same_figures_in_batches(
     nano = Study((str(tmp_path / "nano.parquet"),), sigmas=SIGMA_GRID)
     scales = (Fraction(1), Fraction(2), Fraction(4))
     slower = Study((str(tmp_path / "ortrack.parquet"),), scales=scales)
-    rows = [
-        *compute_study(nano, tmp_path / "a", workers=1).summary,
-        *compute_study(slower, tmp_path / "b", workers=1).summary,
-    ]
+    rows = flat_rows(
+        [
+            *compute_study(nano, tmp_path / "a", workers=1).summary,
+            *compute_study(slower, tmp_path / "b", workers=1).summary,
+        ]
+    )
     assert {row["engine"] for row in rows} == {"batch"}
     found = {
         (row["trace"], row["scale"], row["sigma"], row["forecaster"]): (

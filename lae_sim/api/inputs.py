@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
 from lae_sim.files import labels, sequence_names
-from lae_sim.forecast.base import AnyFactory, Hold, SequenceFactory
+from lae_sim.forecast.base import Hold
 from lae_sim.forecast.costs import parse_cost
-from lae_sim.learning.folds import Trainer
 from lae_sim.learning.registry import find_camera
 from lae_sim.replay.world import TraceLike, named, open_trace, several
 from lae_sim.trace.file import Trace
 from lae_sim.trace.locate import find_traces
 
 if TYPE_CHECKING:
+    from lae_sim.forecast.base import AnyFactory
     from lae_sim.forecast.camera import Camera
+    from lae_sim.learning.folds import Trainer
 
 Traces: TypeAlias = "TraceLike | Sequence[TraceLike] | Mapping[str, TraceLike]"
 """A trace, several, or a mapping from names to traces."""
@@ -115,8 +116,10 @@ def _maker(name: Any, forecaster: Any) -> Any:
         raise LaeError(f"forecasters: the name of a forecaster is text, not {shown(name)}")
     if isinstance(forecaster, type) and hasattr(forecaster, "fit"):
         return forecaster()
-    makers = (str, Trainer, SequenceFactory)
-    if not (callable(forecaster) or isinstance(forecaster, makers)):
+    makes = (
+        callable(forecaster) or hasattr(forecaster, "fit") or hasattr(forecaster, "for_sequence")
+    )
+    if not (makes or isinstance(forecaster, str)):
         raise LaeError(f"forecasters: {shown(forecaster)} is neither a name nor makes forecasters")
     if isinstance(forecaster, type):
         missing = [each for each in ("update", "predict") if not hasattr(forecaster, each)]

@@ -53,7 +53,7 @@ def run_study(
         ...     results = lae_sim.run_study(
         ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
         ...     )
-        >>> [(row.forecaster, round(row["auc"], 4)) for row in results.summary]
+        >>> [(row.forecaster, round(row.scores["auc"], 4)) for row in results.summary]
         [('hold', 0.5722), ('kalman', 0.6291)]
     """
     if folder is not None and not isinstance(folder, (str, os.PathLike)):

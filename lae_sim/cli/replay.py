@@ -204,6 +204,8 @@ def _observers(
     scenario: Scenario, arguments: argparse.Namespace, files: ExitStack
 ) -> list[Observer]:
     """Open the files that were asked for; what each does with a run."""
+    if not any(getattr(arguments, name.replace("-", "_")) for name in (*_FILES, "export-txt")):
+        return []
     from pathlib import Path
 
     from lae_sim.report import export

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from lae_sim._arrays import Floats
 from lae_sim.errors import LaeError
+from lae_sim.evaluation.totals import recovered
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -150,16 +151,6 @@ class Bootstrap:
         """
         shares = self.interval(wins / losses) if (losses > 0).all() else None
         return Recovered(recovered(won, lost), shares)
-
-
-def recovered(won: float, lost: float) -> float | None:
-    """The share of the latency loss won back; None without a loss.
-
-    Args:
-        won: forecast - hold, of means or sums of scores over some sequences.
-        lost: offline - hold, over the same.
-    """
-    return won / lost if lost > 0 else None
 
 
 def holm(ps: Sequence[float]) -> list[float]:

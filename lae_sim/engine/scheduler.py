@@ -75,6 +75,12 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
     Frame 0 starts at time 0 (the initialisation); after that the policy chooses, until it would
     start at or after the end of the stream, ``length`` frame intervals after time 0.
 
+    Args:
+        length: number of world frames.
+        clock: the world's.
+        service: how long a frame takes, ns.
+        policy: which frame is next.
+
     Raises:
         LaeError: if the sequence is empty, a time is negative, a policy goes back in time, or an
             instant does not fit in 64-bit ticks.

@@ -19,6 +19,16 @@ RECOVERED = ("auc", "dp20")
 """The metrics of which a share of the latency loss can be recovered."""
 
 
+def recovered(won: float, lost: float) -> float | None:
+    """The share of the latency loss won back; None without a loss.
+
+    Args:
+        won: forecast - hold, of means or sums of scores over some sequences.
+        lost: offline - hold, over the same.
+    """
+    return won / lost if lost > 0 else None
+
+
 class Mean:
     """A mean over sequences of arrays of numbers, of which those that are NaN leave it."""
 

@@ -125,13 +125,15 @@ def convert_results(
         >>> import pathlib, tempfile
         >>> import lae_sim
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     results, truth = pathlib.Path(folder, "results"), pathlib.Path(folder, "anno")
-        ...     results.mkdir(), truth.mkdir()
-        ...     _ = (results / "car.txt").write_text("1,2,30,40\\n2,2,30,40\\n")
-        ...     _ = (truth / "car.txt").write_text("1,2,30,40\\n3,2,30,40\\n")
-        ...     trace, summary = lae_sim.convert_results(results, truth, time="constant:47ms")
+        ...     for name in ("results", "anno"):
+        ...         pathlib.Path(folder, name).mkdir()
+        ...         boxes = "1,2,30,40" if name == "anno" else "3,2,30,40"
+        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes)
+        ...     trace, summary = lae_sim.convert_results(
+        ...         f"{folder}/results", f"{folder}/anno", time="constant:47ms"
+        ...     )
         >>> trace["car"].boxes.tolist(), summary.median_ms
-        ([[1.0, 2.0, 30.0, 40.0], [2.0, 2.0, 30.0, 40.0]], 47.0)
+        ([[3.0, 2.0, 30.0, 40.0]], 47.0)
     """
     for name, path in (("results", results), ("truth", truth)):
         if not isinstance(path, (str, os.PathLike)):

@@ -232,9 +232,9 @@ def profile_tracker(
         ...         "dcf", sequences="race", out=f"{folder}/dcf.parquet", in_process=True
         ...     )
         ...     trace = lae_sim.read_trace(profile.traces[0].trace)
-        ...     trace["race"].elapsed_ns.min() > 0
+        ...     len(trace["race"])
         ...     profile
-        True
+        160
         <Profile of .../dcf.parquet: 1 sequence, median ... ms>
     """
     plan = ProfilePlan.of(tracker=tracker, **settings)

@@ -199,7 +199,7 @@ class Runs:
         >>> import lae_sim
         >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
         >>> runs
-        <Runs of <Trace of 'slow-and-accurate' on 'synthetic': 8 sequences, 2,400 frames at 30 fps> at 30 fps>
+        <Runs of <Trace of 'slow-and-accurate' on 'synthetic': 8 sequences, ...> at 30 fps>
         >>> sum(len(run.schedule.frames) for run in runs) / runs.trace.frames
         0.71
     """

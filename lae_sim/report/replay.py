@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim.comparison.statistics import recovered
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.totals import RECOVERED, ScoreTotals, Totals
+from lae_sim.evaluation.totals import RECOVERED, ScoreTotals, Totals, recovered
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.table import (
     CHANGE,

@@ -332,8 +332,8 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
         ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
         ...     )
         ...     lae_sim.write_tables(results, f"{folder}/paper")
-        ...     sorted(os.listdir(f"{folder}/paper"))
-        ['attributes.csv', 'attributes.tex', 'ranking.csv', 'ranking.tex', 'table2.csv', 'table2.tex']
+        ...     sorted(name for name in os.listdir(f"{folder}/paper") if name.endswith("tex"))
+        ['attributes.tex', 'ranking.tex', 'table2.tex']
     """
     view = results if isinstance(results, View) else View(results)
     results = view.results

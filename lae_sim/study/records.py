@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from fractions import Fraction
-from functools import cached_property
 from typing import Any
 
 from lae_sim.comparison.statistics import Difference, Interval, Recovered
@@ -16,25 +15,12 @@ MEAN = "mean"
 Plain = str | int | float | None
 
 
-class Record(Mapping[str, Any]):
-    """A record that is also read as its flat row: ``record["auc_low"]``."""
+class Record:
+    """What the results of a study consist of."""
 
     def flat(self) -> dict[str, Plain]:
         """The flat row of JSON and CSV: unknown values are None, what is not asked has no key."""
         return _plain(self)
-
-    @cached_property
-    def _flat(self) -> dict[str, Plain]:
-        return self.flat()
-
-    def __getitem__(self, key: str) -> Any:
-        return self._flat[key]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._flat)
-
-    def __len__(self) -> int:
-        return len(self._flat)
 
 
 def _plain(record: Any, until: str = "") -> dict[str, Plain]:

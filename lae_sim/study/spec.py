@@ -144,6 +144,9 @@ class Study:
 def read_study(path: str | os.PathLike[str]) -> Study:
     """Read a study from a TOML file; local traces are relative to its folder.
 
+    Args:
+        path: of the file.
+
     Raises:
         LaeError: if it cannot be read, is not TOML, or is no valid study.
 

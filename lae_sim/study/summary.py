@@ -22,13 +22,10 @@ from lae_sim.evaluation.metrics import METRICS
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.cells import Cell, Setting
 from lae_sim.study.plan import Plan, Source
-from lae_sim.study.records import MEAN as MEAN
-from lae_sim.study.records import Comparison, Staleness, SummaryRow, Uncertainty
+from lae_sim.study.records import MEAN, Comparison, Staleness, SummaryRow, Uncertainty
 from lae_sim.study.rows import COLUMNS, read_rows
 from lae_sim.study.store import Store
 from lae_sim.trace.columns import to_numpy
-
-Row = Mapping[str, Any]  # of tables that read records as flat rows
 
 
 @dataclass(frozen=True, eq=False)

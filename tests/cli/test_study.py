@@ -29,7 +29,7 @@ from lae_sim.learning.trainers import KalmanTrainer
 from lae_sim.replay.latency import bootstrap, by_frame, constant, scaled
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study import rows as cell_rows
-from lae_sim.study.run import StudyResults, compute_study
+from lae_sim.study.run import StudyResults, compute_study, flat_rows
 from lae_sim.study.spec import Study
 
 SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
@@ -162,7 +162,7 @@ def test_the_summary_has_the_means_of_replay(tmp_path: Path) -> None:
         {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman},
         SIGMA_GRID,
     )
-    rows = {(r["trace"], r["forecaster"], r["sigma"]): r for r in results.summary}
+    rows = {(r["trace"], r["forecaster"], r["sigma"]): r for r in flat_rows(results.summary)}
     kalman = rows["synthetic-slow", "kalman", "mean"]
     assert kalman["auc"] == pytest.approx(found.scores["auc"][1].mean())
     assert kalman["dp20"] == pytest.approx(found.scores["dp20"][1].mean())
@@ -210,7 +210,7 @@ def test_repetitions_are_dealt_out_in_chunks_that_change_nothing(
 def test_jitter_has_its_own_interval_and_probability(tmp_path: Path) -> None:
     results = run(tmp_path, latencies=("recorded", "bootstrap"), repetitions=20)
     rows = {(row["trace"], row["latency"]): row
-            for row in results.summary if row["forecaster"] == "hold"}  # fmt: skip
+            for row in flat_rows(results.summary) if row["forecaster"] == "hold"}  # fmt: skip
     drawn = rows["synthetic-slow", "bootstrap"]
     table = results.to_frame().query(
         "trace == 'synthetic-slow' and latency == 'bootstrap' and forecaster == 'hold'"
@@ -220,7 +220,7 @@ def test_jitter_has_its_own_interval_and_probability(tmp_path: Path) -> None:
     ends = np.quantile(means, [0.025, 0.975])
     assert [drawn["auc_jitter_low"], drawn["auc_jitter_high"]] == pytest.approx(ends.tolist())
     assert "auc_jitter_low" not in rows["synthetic-slow", "recorded"]
-    for pair in results.comparisons:
+    for pair in flat_rows(results.comparisons):
         a, b = (
             results.to_frame()
             .query(f"trace == '{name}' and latency == '{pair['latency']}'")
@@ -244,19 +244,21 @@ def test_times_of_another_device(tmp_path: Path) -> None:
         tmp_path / "out",
         Study((str(SLOW), str(FAST)), timing=(str(other),), sequences=FEW, forecasters=("hold",)),
     )
-    assert {(row["trace"], row["times_from"]) for row in results.summary} == {
+    assert {(row["trace"], row["times_from"]) for row in flat_rows(results.summary)} == {
         ("synthetic-slow", "synthetic-slow"),
         ("synthetic-slow", "other"),
         ("synthetic-fast", "synthetic-fast"),
     }
     twice = run(tmp_path / "twice", forecasters=("hold",), scales=(Fraction(2),))
-    theirs = next(row["auc"] for row in results.summary if row["times_from"] == "other")
-    assert theirs == next(r["auc"] for r in twice.summary if r["trace"] == "synthetic-slow")
+    theirs = next(row["auc"] for row in flat_rows(results.summary) if row["times_from"] == "other")
+    assert theirs == next(
+        r["auc"] for r in flat_rows(twice.summary) if r["trace"] == "synthetic-slow"
+    )
 
 
 def test_what_a_required_auc_asks_for_is_true(tmp_path: Path) -> None:
     study = Study((str(SLOW),), forecasters=("hold",), require_auc=Fraction(55, 100))
-    (found,) = run(tmp_path, study).required
+    (found,) = flat_rows(run(tmp_path, study).required)
     trace = lae_sim.read_trace(SLOW)
 
     def auc(scale: str) -> float:
@@ -272,9 +274,9 @@ def test_what_a_required_auc_asks_for_is_true(tmp_path: Path) -> None:
     assert found["speed_up"] == pytest.approx(1 / Fraction(found["scale"]))
     assert found["fps_at_most"] == pytest.approx(30 * Fraction(found["scale"]))
     paid = replace(study, costs=("hold=1ms",))  # whose time is not one in frames
-    assert run(tmp_path / "paid", paid).required[0]["fps_at_most"] is None
+    assert run(tmp_path / "paid", paid).required[0].fps_at_most is None
     study = Study((str(SLOW),), forecasters=("hold",), require_auc=Fraction(9, 10))
-    (never,) = run(tmp_path / "never", study).required
+    (never,) = flat_rows(run(tmp_path / "never", study).required)
     assert (never["scale"], never["speed_up"], never["beyond"]) == (None, None, "0")
     assert never["auc_without_latency"] < 0.9
 
@@ -324,8 +326,8 @@ def test_only_what_is_missing_or_changed_is_computed(tmp_path: Path) -> None:
 
     shutil.copy(FAST, mine)  # other content under the same name
     assert run(out, study).computed == 2
-    rows = {(row["trace"], row["forecaster"]): row["auc"] for row in first.summary}
-    again = {(r["trace"], r["forecaster"]): r["auc"] for r in run(out, study).summary}
+    rows = {(row["trace"], row["forecaster"]): row["auc"] for row in flat_rows(first.summary)}
+    again = {(r["trace"], r["forecaster"]): r["auc"] for r in flat_rows(run(out, study).summary)}
     assert again["mine", "hold"] == rows["synthetic-fast", "hold"] != rows["mine", "hold"]
 
 
@@ -355,9 +357,7 @@ def test_what_is_trained_is_not_trained_again(
     results = run(tmp_path, study)
     notes = results.notes()
     assert any("trained in 5 folds over 8 sequences" in note for note in notes)
-    table = score_forecasters(
-        {"slow": lae_sim.read_trace(SLOW)}, {"tuned-kalman": KalmanTrainer()}
-    )
+    table = score_forecasters({"slow": lae_sim.read_trace(SLOW)}, {"tuned-kalman": KalmanTrainer()})
     scores = table.query("forecaster == 'tuned-kalman' and metric == 'auc'").set_index("sequence")
     found = results.to_frame().query("forecaster == 'tuned-kalman'").set_index("sequence")
     assert found["auc"].to_dict() == scores["value"].to_dict()
@@ -472,11 +472,11 @@ def test_an_own_policy_is_replayed_in_simpy_which_is_said(
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "policy_of_study.py").write_text(OWN)
     results = run(tmp_path / "out", policies=("latest", "policy_of_study:policy"))
-    engines = {row["policy"]: row["engine"] for row in results.summary}
+    engines = {row["policy"]: row["engine"] for row in flat_rows(results.summary)}
     assert engines == {"latest": "batch", "policy_of_study:policy": "simpy"}
     every = run(tmp_path / "every", policies=("every:2",))
-    own = [row["auc"] for row in results.summary if row["engine"] == "simpy"]
-    assert own == [row["auc"] for row in every.summary]
+    own = [row["auc"] for row in flat_rows(results.summary) if row["engine"] == "simpy"]
+    assert own == [row["auc"] for row in flat_rows(every.summary)]
 
 
 def test_a_worker_that_dies_is_told_in_a_line(tmp_path: Path) -> None:
@@ -522,7 +522,7 @@ def test_files_of_alike_names_keep_apart(tmp_path: Path) -> None:
     shutil.copy(SLOW, tmp_path / "a")
     shutil.copy(FAST, tmp_path / "a.parquet")
     study = Study((str(tmp_path / "a"), str(tmp_path / "a.parquet")), sequences=FEW)
-    rows = run(tmp_path / "out", study).summary
+    rows = flat_rows(run(tmp_path / "out", study).summary)
     assert len({row["auc"] for row in rows}) == len(rows) == 4
 
 
@@ -540,8 +540,8 @@ def test_a_folder_has_one_study_at_a_time(tmp_path: Path) -> None:
 
 def test_a_tracker_slower_than_its_sequences_has_no_time_of_a_call(tmp_path: Path) -> None:
     results = run(tmp_path, latencies=("constant:100s",), forecasters=("hold",))
-    assert {row["elapsed_ms"] for row in results.summary} == {None}
-    assert not any(row["pareto"] for row in results.summary)
+    assert {row["elapsed_ms"] for row in flat_rows(results.summary)} == {None}
+    assert not any(row["pareto"] for row in flat_rows(results.summary))
     lae_sim.write_report(results, tmp_path / "report.html")
     lae_sim.write_tables(results, tmp_path / "tables")
 

@@ -19,7 +19,7 @@ from lae_sim.report.study_tables import (
 from lae_sim.report.study_view import View
 from lae_sim.report.table import Cell, Column, Table, latex_of, tex
 from lae_sim.study.records import MEAN
-from lae_sim.study.run import StudyResults, compute_study
+from lae_sim.study.run import StudyResults, compute_study, flat_rows
 from lae_sim.study.spec import Study
 
 
@@ -47,7 +47,7 @@ def test_ranking_says_what_the_summary_says(results):
         )
         found[key] = entries
     assert len(found) == len(results.summary) == 12
-    for row in results.summary:
+    for row in flat_rows(results.summary):
         ours = found[row["scale"], row["trace"], row["forecaster"]]
         assert ours["AUC"].value == row["auc"]
         assert ours["AUC"].interval == (row["auc_low"], row["auc_high"])
@@ -61,7 +61,9 @@ def test_ranking_says_what_the_summary_says(results):
 
 def test_table2_shows_scale_1_and_changes(results):
     table = table2(View(results))
-    summary = {(r["trace"], r["forecaster"]): r for r in results.summary if r["scale"] == "1"}
+    summary = {
+        (r["trace"], r["forecaster"]): r for r in flat_rows(results.summary) if r["scale"] == "1"
+    }
     assert [row[1].text for row in table.rows] == ["offline", "hold", "kalman"] * 2
     for row in table.rows:
         hold = summary[row[0].text[-4:].strip(), "hold"]
