@@ -182,7 +182,6 @@ def compare_forecasters(
             "forecasters: offline is always in the table: the tracker's own boxes, without latency"
         )
     check_frames(makers, root)
-    find_convention(convention)
     folds = named("folds", partial(whole, least=2), folds)
     seed = named("seed", whole, seed)
     kinds = {(trace.metadata.dataset, trace.metadata.fps) for trace in opened.values()}
@@ -197,6 +196,7 @@ def compare_forecasters(
         convention=convention,
         costs=cost_texts(costs),
     )
+    find_convention(convention)
     if len(several(fps)) > 1 or len(several(policy)) > 1:
         raise LaeError("fps and policy: one of each: compare under others by themselves")
     if not scores_latency(worlds[0].rule()):

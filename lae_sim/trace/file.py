@@ -137,6 +137,9 @@ def held(trace: Trace, frames: int = HELD_FRAMES) -> Trace:
 def validate(path: str | os.PathLike[str]) -> None:
     """Read a whole trace and check it.
 
+    Args:
+        path: the file, or its URL.
+
     Raises:
         TraceError: at the first fault.
 
@@ -154,6 +157,10 @@ def validate(path: str | os.PathLike[str]) -> None:
 
 def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
     """Write a trace, whole or not at all; recordings stream through.
+
+    Args:
+        trace: what to write; its recordings are sorted by name.
+        path: the file, in a folder that is there.
 
     Raises:
         TraceError: if the recordings are not sorted by name or break the format.
