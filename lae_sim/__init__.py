@@ -13,7 +13,7 @@ A short tour, with the traces that come with the sources:
     <Trace of 'slow-and-accurate' on 'synthetic': 8 sequences, 2,400 frames at 30 fps>
     >>> result = lae_sim.evaluate(trace, latency="constant:47ms", forecasters=["hold", "kalman"])
     >>> result
-    <EvaluationResult of slow-and-accurate, constant:47ms: AUC hold 0.5791, kalman 0.6414>
+    <EvaluationResult of synthetic-slow.parquet, constant:47ms: AUC hold 0.5791, kalman 0.6414>
     >>> result.summary[["forecaster", "auc", "offline_auc", "recovered_auc"]].round(3)
       forecaster    auc  offline_auc  recovered_auc
     0       hold  0.579        0.777            NaN

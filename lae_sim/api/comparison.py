@@ -120,7 +120,8 @@ class ComparisonResult:
         scores = ", ".join(f"{row.forecaster} {row.mean:.4f}" for row in first.itertuples())
         setting = f"{first['trace'].iloc[0]}, {first['latency'].iloc[0]}"
         more = len(table.drop_duplicates(["trace", "latency", "scale", "sigma"])) - 1
-        return f"<ComparisonResult of {setting}{f' and {more} more' * bool(more)}: AUC {scores}>"
+        setting += f" and {more} more" * bool(more)
+        return " ".join(f"<ComparisonResult of {setting}: AUC {scores}>".split())
 
     def _repr_html_(self) -> str:
         table = self.summary[self.summary["metric"] == self.metrics[0]]

@@ -23,6 +23,7 @@ from lae_sim.api.inputs import (
     cost_texts,
     labelled_traces,
     named_forecasters,
+    path_of,
 )
 from lae_sim.boxes import iou
 from lae_sim.engine.clock import Number, exact
@@ -139,15 +140,15 @@ class Evaluated:
         """The scores as a JSON object, as ``lae-sim replay --json`` has them."""
         scenario, world = self.scenario, self.scenario.world
         metadata, runs = scenario.trace.metadata, scenario.runs
-        path = path_of(scenario.trace, scenario.label)
+        path = path_of(scenario.trace) or scenario.label
         times = runs.trace if runs.timing is None else runs.timing
         return {
             "trace": path,
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
             "device": metadata.device,
-            "strided": [path_of(trace, "an open trace") for trace in runs.passes],
-            "times_from": path if runs.timing is None else path_of(runs.timing, "an open trace"),
+            "strided": [path_of(trace) or "an open trace" for trace in runs.passes],
+            "times_from": path if runs.timing is None else path_of(runs.timing) or "an open trace",
             "times_note": times.metadata.timing_note,
             "fps": str(runs.clock.fps),
             "policy": label_of(world.policy),
@@ -166,11 +167,6 @@ class Evaluated:
                 attributes,
             ),
         }
-
-
-def path_of(trace: Trace, otherwise: str) -> str:
-    """The path or URL that a trace was read from; something else if from none."""
-    return str(getattr(trace.recordings, "path", otherwise))
 
 
 def scenarios(
@@ -391,7 +387,7 @@ class EvaluationResult:
         scores = ", ".join(f"{row.forecaster} {row.auc:.4f}" for row in rows.itertuples())
         more = f" and {count - 1} more" if count > 1 else ""
         setting = f"{first.scenario.label}, {first.scenario.world.label()}"
-        return f"<EvaluationResult of {setting}{more}: AUC {scores}>"
+        return " ".join(f"<EvaluationResult of {setting}{more}: AUC {scores}>".split())
 
     def _repr_html_(self) -> str:
         table = self.summary

@@ -6,11 +6,12 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
-from lae_sim.files import labels, sequence_names
+from lae_sim.files import sequence_names
 from lae_sim.forecast.base import Hold
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import find_camera
@@ -40,8 +41,8 @@ def labelled_traces(traces: Traces, sequences: Iterable[str] | None = None) -> d
     """Open traces, by the names they have in tables.
 
     Args:
-        traces: each is an open one, or a path, folder, glob or URL. Files are named by themselves
-            where that tells them apart.
+        traces: each is an open one, or a path, folder, glob or URL. Those of files are named by
+            them, by their paths where that is needed to tell them apart; others by their trackers.
         sequences: those wanted; all by default.
 
     Raises:
@@ -57,11 +58,18 @@ def labelled_traces(traces: Traces, sequences: Iterable[str] | None = None) -> d
         raise LaeError("traces: name at least one")
     names = [label for label, _ in opened]
     if not isinstance(traces, Mapping):
-        names = labels(names)
+        short = [Path(label).name if path_of(trace) else label for label, trace in opened]
+        names = short if len(set(short)) == len(short) else names
     found = dict(zip(names, (trace for _, trace in opened)))
     if len(found) < len(opened):
         raise LaeError("traces: several have the same name: give a mapping from names to traces")
     return found
+
+
+def path_of(trace: Trace) -> str | None:
+    """The path or URL that a trace was read from; None if from none."""
+    path: str | None = getattr(trace.recordings, "path", None)
+    return path
 
 
 def _with_labels(traces: Traces) -> Iterator[tuple[str, TraceLike]]:
@@ -77,7 +85,7 @@ def _with_labels(traces: Traces) -> Iterator[tuple[str, TraceLike]]:
             yield from ((path, path) for path in paths)
         else:
             opened = named("traces", open_trace, trace)
-            yield opened.metadata.tracker, opened
+            yield path_of(opened) or opened.metadata.tracker, opened
 
 
 def named_forecasters(forecasters: Forecasters) -> dict[str, Any]:

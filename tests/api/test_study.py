@@ -1,0 +1,109 @@
+"""Running studies in one call."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from fractions import Fraction
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from nasty import nasty_traces
+from places import TRACES
+
+import lae_sim
+
+SLOW, FAST = TRACES / "synthetic-slow.parquet", TRACES / "synthetic-fast.parquet"
+TOML = """
+traces = ["synthetic-slow.parquet"]
+scales = [0.1, 1]
+"""
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> lae_sim.StudyResults:
+    return lae_sim.run_study(
+        traces=[SLOW, str(FAST)], scales=[0.1, 1], folder=tmp_path / "out", workers=1
+    )
+
+
+def test_scores_are_those_of_evaluating(results: lae_sim.StudyResults) -> None:
+    assert results.plan.study.scales == (Fraction(1, 10), 1)
+    evaluated = lae_sim.evaluate([SLOW, FAST], scale=[0.1, 1])
+    summary = results.summary_frame()
+    assert len(summary) == len(evaluated.summary) == 8
+    for row in evaluated.summary.itertuples():
+        (found,) = [
+            each
+            for each in results.summary
+            if f"{each.trace}.parquet" == row.trace
+            and each.forecaster == row.forecaster
+            and float(each.scale) == row.scale
+        ]
+        assert found.scores["auc"] == pytest.approx(row.auc, abs=1e-12)
+        assert found.offline["auc"] == pytest.approx(row.offline_auc, abs=1e-12)
+        assert found.exact == row.exact
+    assert len(results.to_frame()) == len(evaluated.to_frame())
+
+
+def test_what_is_left_in_the_folder(results: lae_sim.StudyResults) -> None:
+    folder = results.folder
+    assert (folder / "report.html").is_file()
+    assert (folder / "tables" / "ranking.tex").is_file()
+    document = json.loads((folder / "study.json").read_text())
+    assert document == json.loads(json.dumps(results.document()))
+    again = lae_sim.run_study(results.plan.study, folder, workers=1, report=False)
+    assert (results.computed, again.computed) == (8, 0)
+    assert not (folder / "report.html").exists()
+    pd.testing.assert_frame_equal(again.to_frame(), results.to_frame())
+
+
+def test_a_file_a_mapping_and_keys_are_the_same_study(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy(SLOW, tmp_path)
+    (tmp_path / "mine.toml").write_text(TOML)
+    monkeypatch.chdir(tmp_path)
+    from_file = lae_sim.run_study(Path("mine.toml"), workers=1, report=False)
+    assert from_file.folder == Path("mine-results")
+    keys = {"traces": "synthetic-slow.parquet", "scales": [0.1, 1]}
+    from_mapping = lae_sim.run_study(keys, workers=1, report=False)
+    assert from_mapping.folder == Path("study-results")
+    from_keys = lae_sim.run_study(**keys, folder="third", workers="1", report=False)
+    made = lae_sim.run_study(lae_sim.Study(**keys), "fourth", workers=1, report=False)
+    for each in (from_mapping, from_keys, made):
+        assert each.plan.study.scales == from_file.plan.study.scales
+        pd.testing.assert_frame_equal(each.to_frame(), from_file.to_frame())
+
+
+def test_an_open_trace_stands_for_its_file(tmp_path: Path) -> None:
+    trace = lae_sim.read_trace(SLOW)
+    results = lae_sim.run_study(traces=trace, folder=tmp_path / "out", workers=1, report=False)
+    assert [source.input.path for source in results.plan.sources] == [str(SLOW)]
+
+
+def test_displays(results: lae_sim.StudyResults) -> None:
+    assert repr(results) == f"<StudyResults of 8 settings, 8 cells in {results.folder}>"
+    html = results._repr_html_()
+    assert html.startswith("<table")
+    assert "<th>scale</th>" in html
+    assert "<th>policy</th>" not in html
+
+
+def test_html_escapes_names(tmp_path: Path) -> None:
+    results = lae_sim.run_study(
+        traces=nasty_traces(tmp_path), folder=tmp_path / "out", workers=1, report=False
+    )
+    assert "<script" not in results._repr_html_()
+    assert "<script>alert" not in repr(results)
+
+
+def test_a_progress_bar(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keys = {"traces": SLOW, "workers": 1, "report": False}
+    lae_sim.run_study(**keys, folder=tmp_path / "a")
+    assert capsys.readouterr() == ("", "")
+    lae_sim.run_study(**keys, folder=tmp_path / "b", progress=True)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "100%" in err
