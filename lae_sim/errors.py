@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
+import difflib
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 
 class LaeError(Exception):
-    """An input or a setting that cannot be used; the message says where and what to do."""
+    """An input or a setting that cannot be used; the message says where and what to do.
+
+    Example:
+        >>> import lae_sim
+        >>> try:
+        ...     lae_sim.evaluate("traces/synthetic-slow.parquet", latency="constant:47")
+        ... except lae_sim.LaeError as error:
+        ...     print(error)
+        latency: '47' is not a duration: write it with its unit, such as 47ms
+    """
 
 
 class TraceError(LaeError):
-    """A trace that is missing, damaged, or breaks the format (see ``traces/FORMAT.md``)."""
+    """A trace that is missing, damaged, or breaks the format (see ``traces/FORMAT.md``).
+
+    Example:
+        >>> import lae_sim
+        >>> try:
+        ...     lae_sim.read_trace("nowhere.parquet")
+        ... except lae_sim.TraceError as error:
+        ...     print(error)
+        nowhere.parquet: no such file
+    """
 
 
 @contextmanager
@@ -31,3 +50,15 @@ def described(error: BaseException) -> str:
     last = traceback.extract_tb(error.__traceback__)[-1]
     message = " ".join(str(error).split())[:300]
     return f"{type(error).__name__}: {message} ({last.filename}, line {last.lineno})"
+
+
+def shown(value: object) -> str:
+    """A value in one line of at most 60 characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def hint(name: object, known: Iterable[str]) -> str:
+    """What was perhaps meant by a name that is not known, to end a message with."""
+    close = difflib.get_close_matches(name, list(known), 1) if isinstance(name, str) else []
+    return f"; did you mean {close[0]!r}?" if close else ""

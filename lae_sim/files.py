@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
 
 
 @contextmanager
@@ -88,6 +88,23 @@ def labels(paths: Sequence[str]) -> list[str]:
     """File names, where they tell the files apart; otherwise the paths."""
     names = [Path(path).name for path in paths]
     return names if len(set(names)) == len(names) else list(paths)
+
+
+def sequence_names(sequences: str | Iterable[str]) -> list[str]:
+    """Names of sequences: one, or several.
+
+    Raises:
+        LaeError: if there is none, or one is not text.
+    """
+    if isinstance(sequences, str) or not isinstance(sequences, Iterable):
+        sequences = [sequences]
+    names = list(sequences)
+    for name in names:
+        if not isinstance(name, str):
+            raise LaeError(f"sequences: a sequence is named by text, not {shown(name)}")
+    if not names:
+        raise LaeError("sequences: name at least one")
+    return names
 
 
 def check_folders(paths: Iterable[str]) -> None:

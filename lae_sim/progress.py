@@ -16,16 +16,19 @@ class ProgressBar:
         title: what stands before it.
         unit: what is counted, in the plural.
         show: whether to show it; by default where somebody looks, on a terminal or in a notebook.
+
+    Attributes:
+        shown: whether it is shown.
     """
 
     def __init__(self, title: str, unit: str, show: bool | None = None) -> None:
-        self._title, self._unit = title, unit
-        self._shown = _somebody_looks() if show is None else show
+        self._title, self._unit = str(title), unit
+        self.shown = _somebody_looks() if show is None else show
         self._bar: Any = None
 
     def __call__(self, done: int, total: int | None, what: str = "") -> None:
         """Show that ``done`` of ``total`` are done, and perhaps what is going on."""
-        if not self._shown:
+        if not self.shown:
             return
         if self._bar is None:
             options = {"desc": self._title, "unit": f" {self._unit}"}

@@ -5,21 +5,30 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.api.inputs import Forecasters, forecaster_names, labelled_traces
+from lae_sim.api.inputs import (
+    Costs,
+    Forecasters,
+    Traces,
+    camera_of,
+    check_frames,
+    cost_texts,
+    labelled_traces,
+    named_forecasters,
+)
 from lae_sim.comparison.forecasters import OFFLINE, score_forecasters, steps
 from lae_sim.comparison.statistics import by_attribute, over_sigmas, summarise
-from lae_sim.engine.clock import Number
+from lae_sim.engine.clock import Number, whole
 from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.metrics import find_convention
-from lae_sim.learning.registry import find_camera, load_any
+from lae_sim.learning.registry import load_any
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
-from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, label_of
+from lae_sim.replay.world import SIGMA_GRID, World, label_of, named, several
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,6 +46,17 @@ class ComparisonResult:
         scores: the tidy table of :func:`lae_sim.comparison.forecasters.score_forecasters`.
         whole_grid: whether the scores are compared as means over the whole grid of sigmas.
         seed: of the bootstrap.
+
+    Example:
+        >>> import lae_sim
+        >>> result = lae_sim.compare_forecasters(
+        ...     "traces/synthetic-slow.parquet", forecasters=["kalman", "least-squares"]
+        ... )
+        >>> table = result.summary.query("metric == 'auc'").set_index("forecaster")
+        >>> table["mean"].round(4).to_dict()
+        {'hold': 0.5722, 'kalman': 0.6291, 'least-squares': 0.6375, 'offline': 0.7773}
+        >>> result.plot()
+        <Figure ...>
     """
 
     traces: Mapping[str, Trace]
@@ -109,7 +129,7 @@ class ComparisonResult:
 
 
 def compare_forecasters(
-    traces: TraceLike | Sequence[TraceLike] | Mapping[str, TraceLike],
+    traces: Traces,
     *,
     forecasters: Forecasters = ("kalman", "least-squares", "tuned-kalman"),
     sigma: Number | Iterable[Number] = 0,
@@ -118,7 +138,7 @@ def compare_forecasters(
     fps: Number | None = None,
     policy: str | Policy = "latest",
     convention: str = "pysot",
-    costs: str | Sequence[str] = (),
+    costs: Costs = (),
     sequences: str | Iterable[str] | None = None,
     root: str | os.PathLike[str] | None = None,
     dataset: str | None = None,
@@ -156,10 +176,18 @@ def compare_forecasters(
         <ComparisonResult of synthetic-slow.parquet, recorded: AUC hold 0.5722, kalman 0.6291, ...>
     """
     opened = labelled_traces(traces, sequences)
-    names, objects = forecaster_names(forecasters)
-    if OFFLINE in names:
-        raise LaeError("offline is always in the table: the tracker's own boxes, without latency")
+    makers = named_forecasters(forecasters)
+    if OFFLINE in makers:
+        raise LaeError(
+            "forecasters: offline is always in the table: the tracker's own boxes, without latency"
+        )
+    check_frames(makers, root)
     find_convention(convention)
+    folds = named("folds", partial(whole, least=2), folds)
+    seed = named("seed", whole, seed)
+    kinds = {(trace.metadata.dataset, trace.metadata.fps) for trace in opened.values()}
+    if root is not None and len(kinds) > 1:
+        raise LaeError("root: the folder of one dataset: compare its traces by themselves")
     worlds = World.sweep(
         fps=fps,
         policy=policy,
@@ -167,22 +195,19 @@ def compare_forecasters(
         scale=scale,
         sigma=sigma,
         convention=convention,
-        costs=costs,
+        costs=cost_texts(costs),
     )
+    if len(several(fps)) > 1 or len(several(policy)) > 1:
+        raise LaeError("fps and policy: one of each: compare under others by themselves")
     if not scores_latency(worlds[0].rule()):
-        raise LaeError(f"{label_of(policy)} never scores latency: there is nothing to forecast")
-    if (
-        root is not None
-        and len({(t.metadata.dataset, t.metadata.fps) for t in opened.values()}) > 1
-    ):
-        raise LaeError("--root is the folder of one dataset: compare its traces by themselves")
+        raise LaeError(
+            f"policy: {label_of(policy)} never scores latency: there is nothing to forecast"
+        )
     rate = worlds[0].fps or next(iter(opened.values())).metadata.fps
-    wanted = [sequences] if isinstance(sequences, str) else sequences
-    folder = None if root is None else os.fspath(root)
-    camera = find_camera(folder, dataset, list(wanted) if wanted else None, rate, camera_lag)
+    camera = camera_of(root, dataset, sequences, rate, camera_lag)
     ready: dict[str, Any] = {
-        name: objects.get(name) or load_any(name, camera)
-        for name in dict.fromkeys(["hold", *names])
+        name: load_any(each, camera) if isinstance(each, str) else each
+        for name, each in {"hold": "hold", **makers}.items()
     }
     total, done = steps(opened, ready, worlds, folds), 0
     with ProgressBar("compare", "steps", progress) as bar:

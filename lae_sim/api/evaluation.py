@@ -14,22 +14,32 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lae_sim.api.inputs import Forecasters, forecaster_names, labelled_traces
+from lae_sim.api.inputs import (
+    Costs,
+    Forecasters,
+    Traces,
+    camera_of,
+    check_frames,
+    cost_texts,
+    labelled_traces,
+    named_forecasters,
+)
 from lae_sim.boxes import iou
 from lae_sim.engine.clock import Number, exact
 from lae_sim.engine.scheduler import Policy
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, hint, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
 from lae_sim.evaluation.totals import Totals
+from lae_sim.files import sequence_names
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes, resolve_costs
-from lae_sim.learning.registry import find_camera, load_forecaster
+from lae_sim.learning.registry import load_forecaster
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.run import Run, Runs
-from lae_sim.replay.world import TraceLike, World, label_of
+from lae_sim.replay.world import TraceLike, World, label_of, named, open_others
 from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
 from lae_sim.trace.file import Trace
 
@@ -167,7 +177,7 @@ def scenarios(
     traces: Mapping[str, Trace],
     worlds: Sequence[World],
     *,
-    factories: Mapping[str, AnyFactory] | None = None,
+    forecasters: Mapping[str, str | AnyFactory] | None = None,
     sequences: Iterable[str] | None = None,
     root: str | os.PathLike[str] | None = None,
     dataset: str | None = None,
@@ -178,7 +188,7 @@ def scenarios(
     Args:
         traces: traces by name.
         worlds: how they are replayed and scored.
-        factories: forecasters of the worlds that are not found by their names.
+        forecasters: what the names of the worlds' forecasters stand for, if not for themselves.
         sequences: those of the traces, if not all, to read of passes too.
         root, dataset, camera_lag: see :func:`lae_sim.learning.registry.find_camera`.
 
@@ -186,21 +196,20 @@ def scenarios(
         LaeError: if there is no such convention, forecaster, or trace of times or passes.
     """
     found = []
-    folder = None if root is None else os.fspath(root)
     names = None if sequences is None else list(sequences)
     for label, trace in traces.items():
         costs: dict[str, int] | None = None
         for world in worlds:
             find_convention(world.convention)
             runs = world.replay(trace, names)
-            camera = find_camera(folder, dataset, names, runs.clock.fps, camera_lag)
-            forecasters = {
-                name: (factories or {}).get(name) or load_forecaster(name, camera)
-                for name in dict.fromkeys(["hold", *world.forecasters])
-            }
+            camera = camera_of(root, dataset, names, runs.clock.fps, camera_lag)
+            factories: dict[str, AnyFactory] = {}
+            for name in dict.fromkeys(["hold", *world.forecasters]):
+                each = (forecasters or {}).get(name, name)
+                factories[name] = load_forecaster(each, camera) if isinstance(each, str) else each
             if costs is None:  # measured once: a sweep is of nothing else
-                costs = resolve_costs(world.costs, forecasters, trace)
-            found.append(Scenario(label, trace, world, runs, forecasters, costs))
+                costs = resolve_costs(world.costs, factories, trace)
+            found.append(Scenario(label, trace, world, runs, factories, costs))
     return found
 
 
@@ -213,6 +222,22 @@ class EvaluationResult:
 
     Attributes:
         parts: one per trace and world.
+
+    Example:
+        >>> import lae_sim
+        >>> result = lae_sim.evaluate("traces/synthetic-slow.parquet", scale=[1, 2])
+        >>> result.summary[["scale", "forecaster", "auc", "recovered_auc"]].round(3)
+           scale forecaster    auc  recovered_auc
+        0    1.0       hold  0.572            NaN
+        1    1.0     kalman  0.629          0.278
+        2    2.0       hold  0.439            NaN
+        3    2.0     kalman  0.501          0.182
+        >>> result.answers("boat-calm", "kalman")[["frame", "source_frame", "iou"]].round(3).tail(2)
+             frame  source_frame    iou
+        298    298           296  0.936
+        299    299           297  0.908
+        >>> result.plot()
+        <Figure ...>
     """
 
     parts: tuple[Evaluated, ...]
@@ -311,15 +336,16 @@ class EvaluationResult:
 
         scenario = self._scenario(trace)
         if forecaster not in scenario.forecasters:
-            raise LaeError(
-                f"forecaster: no {forecaster!r} here: there are {', '.join(scenario.forecasters)}"
-            )
-        chosen = scenario.world.sigmas[0] if sigma is None else exact(sigma)
-        if chosen not in scenario.world.sigmas:
-            raise LaeError(f"sigma: {chosen} was not evaluated")
+            known = ", ".join(scenario.forecasters)
+            raise LaeError(f"forecaster: no {shown(forecaster)} here: there are {known}")
+        sigmas = scenario.world.sigmas
+        chosen = sigmas[0] if sigma is None else named("sigma", exact, sigma)
+        if chosen not in sigmas:
+            raise LaeError(f"sigma: {chosen} is not evaluated here: evaluate(sigma=...) does so")
         run = next((run for run in scenario.runs if run.recording.name == sequence), None)
         if run is None:
-            raise LaeError(f"sequence: no {sequence!r} in {scenario.label}")
+            known = hint(sequence, scenario.trace.names)
+            raise LaeError(f"sequence: no {shown(sequence)} in {scenario.label}{known}")
         found = answers(
             run,
             scenario.trace.metadata,
@@ -458,7 +484,7 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
 
 
 def evaluate(
-    traces: TraceLike | Sequence[TraceLike] | Mapping[str, TraceLike],
+    traces: Traces,
     *,
     forecasters: Forecasters = ("hold", "kalman"),
     sigma: Number | Iterable[Number] = 0,
@@ -469,7 +495,7 @@ def evaluate(
     timing: TraceLike | None = None,
     passes: TraceLike | Sequence[TraceLike] = (),
     convention: str = "pysot",
-    costs: str | Sequence[str] = (),
+    costs: Costs = (),
     sequences: str | Iterable[str] | None = None,
     root: str | os.PathLike[str] | None = None,
     dataset: str | None = None,
@@ -494,7 +520,7 @@ def evaluate(
         timing: another device's trace of the same sequences, to take the times from.
         passes: traces of the same tracker at other strides.
         convention: how frames and thresholds count.
-        costs: what forecasting costs, such as ``"2ms"`` or ``"kalman=2ms"``.
+        costs: what forecasting costs: ``"2ms"``, ``"kalman=2ms"`` or ``{"kalman": "2ms"}``.
         sequences: those wanted; all by default.
         root, dataset, camera_lag: the frames, for ``camera+NAME`` (see
             :func:`lae_sim.learning.registry.find_camera`).
@@ -508,30 +534,29 @@ def evaluate(
         >>> import lae_sim
         >>> result = lae_sim.evaluate("traces/synthetic-slow.parquet", latency="constant:47ms")
         >>> result
-        <EvaluationResult of synthetic-slow.parquet, constant:47ms: AUC hold 0.4331, kalman 0.6058>
+        <EvaluationResult of synthetic-slow.parquet, constant:47ms: AUC hold 0.5791, kalman 0.6414>
         >>> result.to_frame().groupby("forecaster")["auc"].mean().round(4).to_dict()
-        {'hold': 0.4331, 'kalman': 0.6058}
+        {'hold': 0.5791, 'kalman': 0.6414}
     """
     opened = labelled_traces(traces, sequences)
-    names, factories = forecaster_names(forecasters)
+    makers = named_forecasters(forecasters)
+    check_frames(makers, root)
     worlds = World.sweep(
         fps=fps,
         policy=policy,
         latency=latency,
         scale=scale,
-        timing=timing,
-        passes=passes,
         sigma=sigma,
         convention=convention,
-        forecasters=names,
-        costs=costs,
+        forecasters=makers,
+        costs=cost_texts(costs),
+        **open_others(timing, passes),
     )
-    wanted = [sequences] if isinstance(sequences, str) else sequences
     asked = scenarios(
         opened,
         worlds,
-        factories=factories,
-        sequences=wanted,
+        forecasters=makers,
+        sequences=None if sequences is None else sequence_names(sequences),
         root=root,
         dataset=dataset,
         camera_lag=camera_lag,

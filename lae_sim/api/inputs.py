@@ -1,80 +1,179 @@
-"""Arguments as people give them: traces and forecasters."""
+"""Arguments as people give them, each checked, and named in what it raises."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from fractions import Fraction
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from lae_sim.errors import LaeError
-from lae_sim.files import labels
-from lae_sim.replay.world import TraceLike, open_trace, several
+from lae_sim.engine.clock import whole
+from lae_sim.errors import LaeError, shown
+from lae_sim.files import labels, sequence_names
+from lae_sim.forecast.base import Hold
+from lae_sim.forecast.costs import parse_cost
+from lae_sim.learning.registry import find_camera
+from lae_sim.replay.world import TraceLike, named, open_trace, several
 from lae_sim.trace.file import Trace
 from lae_sim.trace.locate import find_traces
 
 if TYPE_CHECKING:
     from lae_sim.forecast.base import AnyFactory
+    from lae_sim.forecast.camera import Camera
     from lae_sim.learning.folds import Trainer
+
+Traces: TypeAlias = "TraceLike | Sequence[TraceLike] | Mapping[str, TraceLike]"
+"""A trace, several, or a mapping from names to traces."""
 
 Forecasters: TypeAlias = (
     "str | AnyFactory | Trainer | Iterable[str | AnyFactory | Trainer] | "
-    "Mapping[str, AnyFactory | Trainer]"
+    "Mapping[str, str | AnyFactory | Trainer]"
 )
 """Forecasters by name, as classes or factories, or as a mapping from names to these."""
 
+Costs: TypeAlias = "str | Iterable[str] | Mapping[str, str]"
+"""What forecasting costs: ``"2ms"``, ``"kalman=2ms"``, or ``{"kalman": "2ms"}``."""
 
-def labelled_traces(
-    traces: TraceLike | Sequence[TraceLike] | Mapping[str, TraceLike],
-    sequences: Iterable[str] | None = None,
-) -> dict[str, Trace]:
+
+def labelled_traces(traces: Traces, sequences: Iterable[str] | None = None) -> dict[str, Trace]:
     """Open traces, by the names they have in tables.
 
     Args:
-        traces: a trace, several, or a mapping from names to traces; each is an open one, or a path,
-            folder, glob or URL. Files are named by themselves where that tells them apart.
-        sequences: those to read of files; all by default.
+        traces: each is an open one, or a path, folder, glob or URL. Files are named by themselves
+            where that tells them apart.
+        sequences: those wanted; all by default.
 
     Raises:
-        LaeError: if there is none, one is missing or damaged, or two have the same name.
+        LaeError: if there is no trace, one is missing or damaged or lacks a sequence, or two have
+            the same name.
     """
-    names = None if sequences is None else frozenset(several(sequences))
-    if isinstance(traces, Mapping):
-        return {label: open_trace(trace, names) for label, trace in traces.items()}
-    opened: list[tuple[str, Trace]] = []
-    for trace in several(traces):
-        if isinstance(trace, Trace):
-            opened.append((trace.metadata.tracker, trace))
-        elif isinstance(trace, (str, os.PathLike)):
-            opened += [(path, open_trace(path, names)) for path in find_traces([os.fspath(trace)])]
-        else:
-            raise LaeError(
-                f"traces: a trace is a path, a URL or what read_trace gives, not {trace!r:.60}"
-            )
+    wanted = None if sequences is None else sequence_names(sequences)
+    opened = [
+        (label, named("traces", partial(open_trace, sequences=wanted), trace))
+        for label, trace in _with_labels(traces)
+    ]
     if not opened:
         raise LaeError("traces: name at least one")
-    found = dict(zip(labels([name for name, _ in opened]), (trace for _, trace in opened)))
+    names = [label for label, _ in opened]
+    if not isinstance(traces, Mapping):
+        names = labels(names)
+    found = dict(zip(names, (trace for _, trace in opened)))
     if len(found) < len(opened):
         raise LaeError("traces: several have the same name: give a mapping from names to traces")
     return found
 
 
-def forecaster_names(forecasters: Forecasters) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """The names of forecasters, and what those that are not named stand for.
+def _with_labels(traces: Traces) -> Iterator[tuple[str, TraceLike]]:
+    if isinstance(traces, Mapping):
+        for label, trace in traces.items():
+            if not isinstance(label, str):
+                raise LaeError(f"traces: the name of a trace is text, not {shown(label)}")
+            yield label, trace
+        return
+    for trace in several(traces):
+        if isinstance(trace, (str, os.PathLike)):
+            paths = named("traces", find_traces, [os.fspath(trace)])
+            yield from ((path, path) for path in paths)
+        else:
+            opened = named("traces", open_trace, trace)
+            yield opened.metadata.tracker, opened
+
+
+def named_forecasters(forecasters: Forecasters) -> dict[str, Any]:
+    """Forecasters by name: text that is still to be looked up, or what makes forecasters.
 
     Raises:
-        LaeError: if one is neither a name nor something that makes forecasters.
+        LaeError: if there is none, one is neither a name nor makes forecasters, or two have the
+            same name.
     """
     if isinstance(forecasters, Mapping):
-        return tuple(forecasters), dict(forecasters)
-    names: list[str] = []
-    objects: dict[str, Any] = {}
-    for each in several(forecasters):
-        if isinstance(each, str):
-            names.append(each)
-        elif callable(each) or hasattr(each, "fit"):
-            name = str(getattr(each, "__name__", type(each).__name__))
-            names.append(name)
-            objects[name] = each
-        else:
-            raise LaeError(f"forecasters: {each!r:.60} is neither a name nor makes forecasters")
-    return tuple(dict.fromkeys(names)), objects
+        pairs = list(forecasters.items())
+    else:
+        pairs = [(_name_of(each), each) for each in several(forecasters)]
+    found: dict[str, Any] = {}
+    for name, each in pairs:
+        made = _maker(name, each)
+        if name in found and found[name] != made:
+            raise LaeError(f"forecasters: two are called {name!r}: give a mapping from names")
+        if name == "hold" and made not in ("hold", Hold):
+            raise LaeError("forecasters: 'hold' is the baseline: give yours another name")
+        found[name] = made
+    if not found:
+        raise LaeError("forecasters: name at least one, such as 'kalman'")
+    return found
+
+
+def _name_of(forecaster: Any) -> str:
+    if isinstance(forecaster, str):
+        return forecaster
+    return str(getattr(forecaster, "__name__", type(forecaster).__name__))
+
+
+def _maker(name: Any, forecaster: Any) -> Any:
+    """A name, or what makes forecasters; of a class of trainers, a trainer."""
+    if not isinstance(name, str):
+        raise LaeError(f"forecasters: the name of a forecaster is text, not {shown(name)}")
+    if isinstance(forecaster, type) and hasattr(forecaster, "fit"):
+        return forecaster()
+    makes = (
+        callable(forecaster) or hasattr(forecaster, "fit") or hasattr(forecaster, "for_sequence")
+    )
+    if not (makes or isinstance(forecaster, str)):
+        raise LaeError(f"forecasters: {shown(forecaster)} is neither a name nor makes forecasters")
+    if isinstance(forecaster, type):
+        missing = [each for each in ("update", "predict") if not hasattr(forecaster, each)]
+        if missing:
+            raise LaeError(f"forecasters: the class {name} has no {' and no '.join(missing)}")
+    return forecaster
+
+
+def cost_texts(costs: Costs) -> tuple[str, ...]:
+    """Costs as command lines have them.
+
+    Raises:
+        LaeError: if one is no duration, and not ``"measured"``.
+    """
+    texts = (
+        [f"{name}={cost}" for name, cost in costs.items()]
+        if isinstance(costs, Mapping)
+        else several(costs)
+    )
+    for text in texts:
+        if not isinstance(text, str):
+            raise LaeError(f"costs: {shown(text)} is not text, such as '2ms' or 'kalman=2ms'")
+        named("costs", parse_cost, text.rpartition("=")[2])
+    return tuple(texts)
+
+
+def check_frames(forecasters: Mapping[str, Any], root: object) -> None:
+    """Check that the frames are given, if a forecaster needs them.
+
+    Raises:
+        LaeError: if they are not.
+    """
+    for each in forecasters.values():
+        if root is None and isinstance(each, str) and each.startswith("camera+"):
+            raise LaeError(f"root: {each} needs the frames: give the dataset's folder")
+
+
+def camera_of(
+    root: str | os.PathLike[str] | None,
+    dataset: str | None,
+    sequences: Iterable[str] | None,
+    fps: Fraction,
+    lag: int | None,
+) -> Camera | None:
+    """The camera's motion (see :func:`lae_sim.learning.registry.find_camera`).
+
+    Raises:
+        LaeError: if the frames cannot be found.
+    """
+    if root is None:
+        return None
+    if not isinstance(root, (str, os.PathLike)):
+        raise LaeError(f"root: the dataset's folder is a path, not {shown(root)}")
+    if lag is not None:
+        lag = named("camera_lag", whole, lag)
+    names = None if sequences is None else sequence_names(sequences)
+    return find_camera(os.fspath(root), dataset, names, fps, lag)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lae_sim.errors import LaeError
+from lae_sim.engine.clock import whole
+from lae_sim.errors import LaeError, shown
 from lae_sim.progress import ProgressBar
+from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
 from lae_sim.report.study_tables import write_tables
 from lae_sim.report.study_view import View
@@ -50,31 +53,40 @@ def run_study(
         ...     results = lae_sim.run_study(
         ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
         ...     )
-        >>> [(row.forecaster, round(row.auc, 4)) for row in results.summary]
+        >>> [(row.forecaster, round(row.scores["auc"], 4)) for row in results.summary]
         [('hold', 0.5722), ('kalman', 0.6291)]
     """
-    base, kept = None, folder or "study-results"
-    if study is None:
-        made = Study.of(keys)
-    elif keys:
-        raise LaeError(f"{next(iter(keys))}: give a study, or its keys, not both")
-    elif isinstance(study, Study):
-        made = study
-    elif isinstance(study, Mapping):
-        made = Study.of(study)
-    else:
-        path = Path(study)
-        made, base, kept = read_study(str(path)), path.parent, folder or f"{path.stem}-results"
-    if workers is not None and scheduler is not None:
-        raise LaeError("--scheduler says where to compute: --workers is for this machine")
+    if folder is not None and not isinstance(folder, (str, os.PathLike)):
+        raise LaeError(f"folder: a path, not {shown(folder)}")
+    if workers is not None:
+        workers = named("workers", partial(whole, least=1), workers)
+        if scheduler is not None:
+            raise LaeError("workers: for this machine: a scheduler says where to compute instead")
+    made, base, kept = _asked_for(study, keys)
     with ProgressBar("study", "tasks", progress) as bar:
 
         def advance(what: str, done: int, total: int) -> None:
             bar(done, total, what)
 
-        results = compute_study(made, kept, base, workers, scheduler, advance)
+        results = compute_study(made, folder or kept, base, workers, scheduler, advance)
     write_views(results, report)
     return results
+
+
+def _asked_for(study: object, keys: Mapping[str, Any]) -> tuple[Study, Path | None, str]:
+    """The study, the folder that its paths are relative to, and where its results go."""
+    if study is not None and keys:
+        raise LaeError(f"{next(iter(keys))}: give a study, or its keys, not both")
+    if isinstance(study, Study):
+        return study, None, "study-results"
+    if study is None or isinstance(study, Mapping):
+        return Study.of(keys if study is None else study), None, "study-results"
+    if not isinstance(study, (str, os.PathLike)) or str(study).endswith(".parquet"):
+        raise LaeError(
+            f"study: {shown(study)} is no TOML file and no Study; name traces by traces=..."
+        )
+    path = Path(study)
+    return read_study(path), path.parent, f"{path.stem}-results"
 
 
 def write_views(results: StudyResults, report: bool = True) -> None:

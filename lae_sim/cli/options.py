@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from itertools import product
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lae_sim.engine.clock import parse_fps, parse_rational, whole
@@ -184,10 +185,14 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
     Raises:
         LaeError: if there is no such policy or latency, or some do not go together.
     """
-    from lae_sim.replay.world import World
+    from lae_sim.replay.latency import scaled
+    from lae_sim.replay.world import World, parse_latency, parse_policy, several
 
+    parse_policy(arguments.policy)  # what is wrong with an option is said without its Python name
+    for latency, scale in product(several(arguments.latency), several(arguments.latency_scale)):
+        scaled(parse_latency(latency), scale)
     return World.sweep(
-        fps=arguments.fps,
+        fps=arguments.fps or None,
         policy=arguments.policy,
         latency=arguments.latency,
         scale=arguments.latency_scale,

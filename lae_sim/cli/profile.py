@@ -167,47 +167,46 @@ def _profile(arguments: argparse.Namespace) -> int:
     import json
 
     from lae_sim.plugins import parse_options
-    from lae_sim.profile.run import profile_tracker
+    from lae_sim.profile.run import ProfilePlan, run_profile
 
     options = parse_options(dict(arguments.option))
     if arguments.device is not None:
         options["device"] = arguments.device
     if arguments.trust_checkpoint:
         options["trust_checkpoint"] = True
+    plan = ProfilePlan(
+        tracker=arguments.tracker,
+        options=options,
+        translate=arguments.translate,
+        python=arguments.python,
+        in_process=arguments.in_process,
+        threads=arguments.threads,
+        frame_timeout=arguments.frame_timeout,
+        warmup=arguments.warmup,
+        dataset=arguments.dataset,
+        root=arguments.root,
+        sequences=arguments.sequence,
+        box=arguments.box,
+        fps=arguments.fps,
+        mode=arguments.mode,
+        policy=arguments.policy,
+        pre_forecaster=arguments.pre_forecaster,
+        pre_forecaster_cost=arguments.pre_forecaster_cost,
+        keep_size=arguments.keep_size,
+        timing=arguments.timing,
+        strides=tuple(arguments.stride),
+        closed_loops=tuple(arguments.closed_loop),
+        repeat=arguments.repeat,
+        include_decode=arguments.include_decode,
+    )
     with closing(ProgressBar(arguments.tracker, "frames")) as bar:
 
         def notice(text: str) -> None:
             bar.close()
             print(f"{PROGRAM}: {text}", file=sys.stderr)
 
-        profile = profile_tracker(
-            arguments.tracker,
-            out=arguments.out,
-            resume=arguments.resume,
-            progress=bar,
-            notice=notice,
-            options=options,
-            translate=arguments.translate,
-            python=arguments.python,
-            in_process=arguments.in_process,
-            threads=arguments.threads,
-            frame_timeout=arguments.frame_timeout,
-            warmup=arguments.warmup,
-            dataset=arguments.dataset,
-            root=arguments.root,
-            sequences=arguments.sequence,
-            box=arguments.box,
-            fps=arguments.fps,
-            mode=arguments.mode,
-            policy=arguments.policy,
-            pre_forecaster=arguments.pre_forecaster,
-            pre_forecaster_cost=arguments.pre_forecaster_cost,
-            keep_size=arguments.keep_size,
-            timing=arguments.timing,
-            strides=arguments.stride,
-            closed_loops=arguments.closed_loop,
-            repeat=arguments.repeat,
-            include_decode=arguments.include_decode,
+        profile = run_profile(
+            plan, arguments.out, resume=arguments.resume, progress=bar, notice=notice
         )
     if not profile.traces:  # it was complete already
         return 0

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser
 from lae_sim.engine.clock import whole
+from lae_sim.errors import LaeError
 
 if TYPE_CHECKING:
     pass
@@ -78,6 +79,8 @@ def _study(arguments: argparse.Namespace) -> bool:
 
     from lae_sim.api.study import run_study
 
+    if arguments.workers is not None and arguments.scheduler is not None:
+        raise LaeError("--scheduler says where to compute: --workers is for this machine")
     results = run_study(
         arguments.study,
         arguments.out,

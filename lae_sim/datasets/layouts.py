@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
@@ -20,7 +21,9 @@ from lae_sim._arrays import Floats
 from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.synthetic import synthetic_dataset
-from lae_sim.errors import LaeError
+from lae_sim.engine.clock import Number, parse_fps
+from lae_sim.errors import LaeError, shown
+from lae_sim.files import sequence_names
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 _FPS = {"UAV123_10fps": 10, "GOT-10k": 10}  # the others have 30
@@ -54,9 +57,9 @@ _CLIP_FIRST = {"bird1_2": 775, "bird1_3": 1573, "uav1_3": 2473}
 def find_dataset(
     name: str | None = None,
     root: str | Path | None = None,
-    sequences: Sequence[str] | None = None,
+    sequences: str | Sequence[str] | None = None,
     box: Sequence[float] | None = None,
-    fps: Fraction | None = None,
+    fps: Number | None = None,
 ) -> Dataset:
     """Find a dataset's images and ground truth.
 
@@ -76,10 +79,26 @@ def find_dataset(
 
     Raises:
         LaeError: if something is missing or does not fit; it says what, and where.
+
+    Example:
+        >>> import lae_sim
+        >>> dataset = lae_sim.find_dataset("synthetic", sequences=["car", "race"])
+        >>> dataset.name, dataset.fps, [sequence.name for sequence in dataset.sequences]
+        ('synthetic', Fraction(30, 1), ['car', 'race'])
+        >>> dataset.sequences[0].read(0).shape
+        (360, 640, 3)
     """
+    sequences = None if sequences is None else sequence_names(sequences)
+    fps = None if fps is None else parse_fps(fps)
+    if box is not None and len(box) != 4:
+        raise LaeError(f"box: x, y, w, h in pixels, not {shown(box)}")
+    if not isinstance(root, (str, os.PathLike, type(None))):
+        raise LaeError(f"root: the dataset's folder is a path, not {shown(root)}")
     if root is None:
         if name not in (None, "synthetic"):
-            raise LaeError(f"give the folder of {name} with --root; only synthetic needs none")
+            raise LaeError(
+                f"give the folder of {name} with --root (root=...); only synthetic needs none"
+            )
         synthetic = {sequence.name: sequence for sequence in synthetic_dataset().sequences}
         chosen = _choose(sequences, synthetic, "the synthetic dataset")
         return Dataset("synthetic", fps or Fraction(30), [synthetic[name] for name in chosen])

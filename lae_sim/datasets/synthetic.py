@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from lae_sim._arrays import Floats
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
 
 _SIZE = np.array([640.0, 360.0])
 _CENTRE = complex(*(_SIZE - 1) / 2)
@@ -95,7 +95,18 @@ def synthetic_dataset(seed: int = 0) -> Dataset:
 
     Args:
         seed: another seed gives other paths and textures of about the same difficulty.
+
+    Raises:
+        LaeError: if the seed is no whole number from 0.
+
+    Example:
+        >>> import lae_sim
+        >>> race = lae_sim.synthetic_dataset().sequences[7]
+        >>> race.name, len(race), race.truth[0].round().tolist()
+        ('race', 160, [362.0, 139.0, 29.0, 55.0])
     """
+    if type(seed) is not int or seed < 0:
+        raise LaeError(f"seed: a whole number from 0, not {shown(seed)}")
     scenes = (replace(scene, seed=seed) for scene in _SCENES)
     return Dataset("synthetic", Fraction(30), [_sequence(scene) for scene in scenes])
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from fractions import Fraction
+from numbers import Integral
 from operator import index
 from typing import TypeAlias
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
 
 NS_PER_SECOND = 10**9
 MAX_INT64 = 2**63 - 1
@@ -49,9 +50,11 @@ def exact(value: Number) -> Fraction:
     Raises:
         LaeError: if it is no exact number, such as ``"1/0"``, 1e-9 or ``True``.
     """
-    if isinstance(value, bool) or not isinstance(value, (int, float, str, Fraction)):
-        raise LaeError(f"{value!r:.40} is not an exact number, such as 2, 0.5 or '1/3'")
-    return Fraction(value) if isinstance(value, (int, Fraction)) else parse_rational(str(value))
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        return Fraction(int(value))  # one of NumPy's too
+    if isinstance(value, bool) or not isinstance(value, (float, str, Fraction)):
+        raise LaeError(f"{shown(value)} is not an exact number, such as 2, 0.5 or '1/3'")
+    return value if isinstance(value, Fraction) else parse_rational(str(value))
 
 
 def parse_fps(value: Number) -> Fraction:
@@ -109,15 +112,18 @@ def duration_ns(duration: str | None, ns: int | None) -> int:
     return found
 
 
-def whole(text: str, least: int = 0) -> int:
-    """A whole number from ``least``.
+def whole(value: int | str, least: int = 0) -> int:
+    """A whole number from ``least``, or the text of one.
 
     Raises:
-        LaeError: if the text is none.
+        LaeError: if it is none, too low, or does not fit in 64 bits.
     """
-    if not (text.isascii() and text.isdigit() and len(text) < 19 and int(text) >= least):
-        raise LaeError(f"{text!r} is not a whole number from {least}")
-    return int(text)
+    written = isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 19
+    counted = isinstance(value, Integral) and not isinstance(value, bool)
+    number = int(value) if written or counted else -1
+    if not least <= number <= MAX_INT64:
+        raise LaeError(f"{shown(value)} is not a whole number from {least}")
+    return number
 
 
 @dataclass(frozen=True)

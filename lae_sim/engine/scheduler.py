@@ -17,7 +17,7 @@ import numpy as np
 
 from lae_sim._arrays import Ints
 from lae_sim.engine.clock import Clock
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
 
 if TYPE_CHECKING:
     import simpy
@@ -75,13 +75,28 @@ def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Sch
     Frame 0 starts at time 0 (the initialisation); after that the policy chooses, until it would
     start at or after the end of the stream, ``length`` frame intervals after time 0.
 
+    Args:
+        length: number of world frames.
+        clock: the world's.
+        service: how long a frame takes, ns.
+        policy: which frame is next.
+
     Raises:
         LaeError: if the sequence is empty, a time is negative, a policy goes back in time, or an
             instant does not fit in 64-bit ticks.
         TypeError: if a time is not an integer, such as seconds as a float.
+
+    Example:
+        >>> import lae_sim
+        >>> from lae_sim.engine import Clock, latest
+        >>> schedule = lae_sim.simulate(9, Clock.at(30), lambda frame: 47_000_000, latest)
+        >>> schedule.frames.tolist()
+        [0, 1, 2, 4, 5, 7, 8]
     """
     import simpy
 
+    if not isinstance(clock, Clock):
+        raise LaeError(f"clock: such as Clock.at(30), not {shown(clock)}")
     if length < 1:
         raise LaeError("a sequence needs at least one frame")
     calls: list[Call] = []

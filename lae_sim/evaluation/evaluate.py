@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from fractions import Fraction
@@ -10,12 +11,13 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.errors import LaeError, explained
+from lae_sim.errors import LaeError, explained, shown
 from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scorer
 from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run
+from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
 
@@ -208,7 +210,19 @@ def evaluate_runs(
 
     Raises:
         LaeError: if there is no run or no forecaster, or whatever iterating over the runs raises.
+
+    Example:
+        >>> import lae_sim
+        >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
+        >>> makers = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
+        >>> scores = lae_sim.evaluate_runs(runs, runs.trace.metadata, makers).scores["auc"]
+        >>> scores.shape, scores.mean(axis=(1, 2)).round(4).tolist()
+        ((2, 8, 1), [0.5791, 0.6414])
     """
+    if isinstance(runs, (str, os.PathLike, Trace)):
+        raise LaeError(f"runs: what replay_trace gives, not {shown(runs)}; evaluate takes traces")
+    if not isinstance(forecasters, Mapping):
+        raise LaeError(f"forecasters: factories by name, not {shown(forecasters)}")
     groups = evaluate_groups(runs, metadata, forecasters, sigmas, convention, costs)
     return Evaluation.joined(list(groups))
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
+from lae_sim.engine.clock import Number, exact
 from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.replay.run import Run
 
@@ -36,9 +37,7 @@ class Event(NamedTuple):
     source_frame: int | None = None
 
 
-def event_log(
-    run: Run, sigma: Fraction = Fraction(0), pairing: Pairing | None = None
-) -> list[Event]:
+def event_log(run: Run, sigma: Number = Fraction(0), pairing: Pairing | None = None) -> list[Event]:
     """All events of a run, for queries at one permitted latency.
 
     Within one tick frames arrive first, then come the tracker's events as it made them, then
@@ -48,7 +47,18 @@ def event_log(
         run: one replayed sequence.
         sigma: permitted latency of the queries, frames.
         pairing: of the run at that sigma, where it is known already.
+
+    Raises:
+        LaeError: if the permitted latency is no exact number.
+
+    Example:
+        >>> import lae_sim
+        >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
+        >>> log = lae_sim.event_log(next(iter(runs)))
+        >>> [(event.kind, event.frame) for event in log[:3]]
+        [('frame arrived', 0), ('processing started', 0), ('query answered', 0)]
     """
+    sigma = exact(sigma)
     queries = _queries(run, sigma, pairing or pair([run.schedule], [sigma]))
     events = [*_world(run), *_tracker(run), *queries]
     return sorted(events, key=lambda event: event.tick)  # stable: each stream is in causal order

@@ -17,7 +17,7 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import centre, iou
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, hint, shown
 
 CENTRE_THRESHOLDS = np.arange(51, dtype=np.float64)
 NORM_THRESHOLDS = np.arange(51) / 100
@@ -79,6 +79,15 @@ CONVENTIONS = {
         Convention("exclude", "size", leaves_out=True),
     )
 }
+"""How frames and thresholds count, by the names that arguments take.
+
+Example:
+    >>> import lae_sim
+    >>> list(lae_sim.CONVENTIONS)
+    ['pysot', 'elae', 'otb', 'got10k', 'got10k-101', 'exclude']
+    >>> lae_sim.CONVENTIONS["got10k"].leaves_out
+    True
+"""
 
 
 PYSOT = CONVENTIONS["pysot"]
@@ -91,8 +100,9 @@ def find_convention(name: str) -> Convention:
     Raises:
         LaeError: if there is none of that name.
     """
-    if name not in CONVENTIONS:
-        raise LaeError(f"no convention {name!r}: there are {', '.join(CONVENTIONS)}")
+    if not isinstance(name, str) or name not in CONVENTIONS:
+        known = ", ".join(CONVENTIONS) + hint(name, CONVENTIONS)
+        raise LaeError(f"no convention {shown(name)}: there are {known}")
     return CONVENTIONS[name]
 
 

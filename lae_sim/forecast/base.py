@@ -41,7 +41,25 @@ ImageSize = Optional[tuple[int, int]]
 
 
 class Forecaster(Protocol):
-    """One target's motion, from the outputs so far; boxes are ``x, y, w, h`` in pixels."""
+    """One target's motion, from the outputs so far; boxes are ``x, y, w, h`` in pixels.
+
+    Any class with these methods will do; it is made with the first box and the image size.
+
+    Example:
+        >>> import lae_sim
+        >>> class Drift:
+        ...     def __init__(self, box, image_size=None):
+        ...         self.frame, self.box = 0, box
+        ...
+        ...     def update(self, frame, box):
+        ...         self.frame, self.box = frame, box
+        ...
+        ...     def predict(self, frame):
+        ...         x, y, w, h = self.box
+        ...         return [x + 2 * (frame - self.frame), y, w, h]
+        >>> lae_sim.evaluate("traces/synthetic-slow.parquet", forecasters=Drift)
+        <EvaluationResult of synthetic-slow.parquet, recorded: AUC hold 0.5722, Drift 0.5542>
+    """
 
     def update(self, frame: int, box: Sequence[float]) -> None:
         """Take in the box of a newer frame."""
@@ -158,7 +176,15 @@ def notes_of(factory: Any, sequences: Sequence[str]) -> list[str]:
 
 
 class Hold:
-    """No forecast: the latest box stands. The baseline of every comparison."""
+    """No forecast: the latest box stands. The baseline of every comparison.
+
+    Example:
+        >>> import lae_sim
+        >>> forecaster = lae_sim.Hold([10, 20, 30, 40])
+        >>> forecaster.update(3, [16, 20, 30, 40])
+        >>> forecaster.predict(6)
+        [16, 20, 30, 40]
+    """
 
     memoryless = True  # looks at the latest output alone, so one history serves every sigma
 

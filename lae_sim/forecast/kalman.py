@@ -182,7 +182,16 @@ class _Filter:
 
 
 class Kalman:
-    """The paper's filter, exactly; or another of its family."""
+    """The paper's filter, exactly; or another of its family.
+
+    Example:
+        >>> import lae_sim
+        >>> forecaster = lae_sim.Kalman([10, 20, 30, 40])
+        >>> for frame in range(1, 6):
+        ...     forecaster.update(frame, [10 + 2 * frame, 20, 30, 40])
+        >>> [round(value, 2) for value in forecaster.predict(8)]
+        [25.93, 20.0, 30.0, 40.0]
+    """
 
     def __init__(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,8 +12,8 @@ import numpy as np
 
 from lae_sim._arrays import Ints
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
-from lae_sim.engine.clock import Clock, parse_fps
-from lae_sim.errors import LaeError
+from lae_sim.engine.clock import Clock, Number, parse_fps
+from lae_sim.errors import LaeError, shown
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.importers.results import (
     NO_TIMES,
@@ -78,7 +79,7 @@ def convert_results(
     truth: str | Path,
     *,
     format: str = "auto",
-    fps: str | None = None,
+    fps: Number | None = None,
     time: str = "measured",
     time_unit: str | None = None,
     repetition: int = 1,
@@ -98,8 +99,8 @@ def convert_results(
         results: folder of one tracker's results, or a file.
         truth: the dataset's folder (see :mod:`lae_sim.datasets.annotations`).
         format: a name of :data:`lae_sim.importers.results.FORMATS`, or ``"auto"``.
-        fps: world frames per second as exact text; by default 30, or 10 if the dataset's name says
-            ``10fps``.
+        fps: world frames per second, such as ``30`` or ``"30000/1001"``; by default 30, or 10 if
+            the dataset's name says ``10fps``.
         time: where times come from (see :func:`lae_sim.importers.results.given_times`).
         time_unit: of measured times: ``"s"`` (the default), ``"ms"``, ``"us"`` or ``"ns"``.
         repetition: which run to take where the toolkit repeats them, from 1.
@@ -119,7 +120,24 @@ def convert_results(
     Raises:
         LaeError: if the results or the ground truth are missing or damaged, or do not fit each
             other.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> import lae_sim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for name in ("results", "anno"):
+        ...         pathlib.Path(folder, name).mkdir()
+        ...         boxes = "1,2,30,40" if name == "anno" else "3,2,30,40"
+        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes)
+        ...     trace, summary = lae_sim.convert_results(
+        ...         f"{folder}/results", f"{folder}/anno", time="constant:47ms"
+        ...     )
+        >>> trace["car"].boxes.tolist(), summary.median_ms
+        ([[3.0, 2.0, 30.0, 40.0]], 47.0)
     """
+    for name, path in (("results", results), ("truth", truth)):
+        if not isinstance(path, (str, os.PathLike)):
+            raise LaeError(f"{name}: a path, not {shown(path)}")
     if repetition < 1:
         raise LaeError("--repetition counts from 1")
     results = Path(results)
@@ -134,8 +152,8 @@ def convert_results(
     if not matched:
         raise LaeError("--exclude leaves no sequence")
     dataset = dataset or annotations.dataset
-    fps = fps or ("10" if "10fps" in dataset.lower() else "30")
-    clock = Clock.at(parse_fps(fps))
+    rate = str(fps or ("10" if "10fps" in dataset.lower() else 30))
+    clock = Clock.at(parse_fps(rate))
     tracker = tracker or tracker_name(kind, results, matched)
     given = given_times(time, tracker)
     schedule: dict[str, Any] = {"kind": "every-frame"}
@@ -151,7 +169,7 @@ def convert_results(
 
         recordings, timing = _every_frame(matched, annotations, read, given, progress)
     metadata = Metadata.new(
-        fps,
+        rate,
         **schedule,
         tracker={"name": tracker},
         device={"model": device} if device else {},
@@ -164,7 +182,7 @@ def convert_results(
     summary = ConversionSummary(
         format=kind,
         schedule=metadata.kind,
-        fps=fps,
+        fps=rate,
         tracker=tracker,
         dataset=dataset,
         timing=timing,

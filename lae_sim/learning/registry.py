@@ -8,7 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, cast
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, hint, shown
 from lae_sim.plugins import bound, imported, key_and_value, parse_options
 
 if TYPE_CHECKING:
@@ -56,6 +56,13 @@ def load_forecaster(name: str, camera: Camera | None = None) -> AnyFactory:
     Raises:
         LaeError: if there is none of that name, it must be trained first, its options do not fit,
             or it cannot be imported.
+
+    Example:
+        >>> import lae_sim
+        >>> lae_sim.load_forecaster("kalman") is lae_sim.Kalman
+        True
+        >>> lae_sim.load_forecaster("kalman:q=3,decay=0.99")
+        TunedKalman(q=3, r=10.0, p0=100.0, decay=0.99, state='corner')
     """
     found = load_any(name, camera)
     if needs_training(found):
@@ -77,6 +84,8 @@ def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:
     Raises:
         LaeError: as :func:`load_forecaster`.
     """
+    if not isinstance(name, str):
+        raise LaeError(f"a forecaster is named by text, such as 'kalman', not {shown(name)}")
     what = f"forecaster {name!r}"
     if name.startswith("camera+"):
         return _over_camera(name, camera)
@@ -93,7 +102,8 @@ def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:
         return _built_in(what, kind, value)
     if not colon:
         names = ", ".join([*BUILT_IN, "kalman:q=...", "learned:FILE.pt", "camera+NAME"])
-        raise LaeError(f"no {what}: there are {names}, and package.module:factory")
+        known = hint(name, (*BUILT_IN, "tuned-kalman", "learned"))
+        raise LaeError(f"no {what}: there are {names}, and package.module:factory{known}")
     factory: AnyFactory | Trainer = imported(what, name)
     if isinstance(factory, type) and hasattr(factory, "fit"):
         factory = bound(what, factory, [], {})

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from fractions import Fraction
 from functools import partial
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
 from lae_sim.datasets.frames import Dataset, ImageSequence
 from lae_sim.datasets.layouts import find_dataset
-from lae_sim.engine.clock import NS_PER_SECOND, Clock, parse_duration, parse_fps, parse_stride
-from lae_sim.errors import LaeError
-from lae_sim.files import check_distinct
+from lae_sim.engine.clock import (
+    NS_PER_SECOND,
+    Clock,
+    parse_duration,
+    parse_fps,
+    parse_stride,
+    whole,
+)
+from lae_sim.errors import LaeError, hint, shown
+from lae_sim.files import check_distinct, check_folders, sequence_names
 from lae_sim.forecast.camera import Camera
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import load_forecaster
@@ -37,9 +47,13 @@ from lae_sim.profile.passes import (
 from lae_sim.profile.timed import TimedTracker
 from lae_sim.profile.translation import Translated
 from lae_sim.profile.worker import InProcess, Worker
+from lae_sim.progress import ProgressBar
 from lae_sim.replay.strides import phases
-from lae_sim.replay.world import parse_policy
+from lae_sim.replay.world import flag, named, parse_policy, several, text
 from lae_sim.trace.file import read_trace
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 MODES = ("every-frame", "real-time")
 
@@ -103,35 +117,37 @@ class ProfilePlan:
 
     def __post_init__(self) -> None:
         if self.mode not in (None, *MODES):
-            raise LaeError(f"no mode {self.mode!r}: there are {' and '.join(MODES)}")
+            raise LaeError(f"mode: no {self.mode!r}: there are {' and '.join(MODES)}")
         if not self.real_time and (self.policy or self.timing):
-            raise LaeError("--policy and --timing are for --mode real-time")
+            raise LaeError("policy and timing are for mode real-time")
         if self.real_time and (self.strides or self.closed_loops):
-            raise LaeError("--stride and --closed-loop go with --mode every-frame")
+            raise LaeError("strides and closed loops go with mode every-frame")
         if (self.translate or self.keep_size) and self.pre_forecaster is None:
-            raise LaeError("--translate and --keep-size are ways to use a --pre-forecaster")
+            raise LaeError("translate and keep_size are ways to use a pre_forecaster")
 
     @classmethod
     def of(cls, **settings: Any) -> ProfilePlan:
         """A plan from text and plain numbers, as command lines have them.
 
         Args:
-            settings: the attributes by name; ``fps`` and ``strides`` may be text (``"30000/1001"``,
-                ``"3/2"``) or numbers, ``frame_timeout`` and ``pre_forecaster_cost`` text
-                (``"2ms"``, ``"measured"``).
+            settings: the attributes by name. Rates and strides may be text (``"30000/1001"``,
+                ``"3/2"``) or numbers; durations are text (``"2ms"``), and a cost may be
+                ``"measured"``; one sequence, stride or closed loop needs no list.
 
         Raises:
-            LaeError: if a value is impossible, or some do not go together.
+            LaeError: if a value is impossible, or some do not go together; it names the setting.
+            TypeError: if there is no such setting.
         """
-        exact = dict(settings)
-        if exact.get("fps") is not None:
-            exact["fps"] = parse_fps(exact["fps"])
-        if "strides" in exact:
-            exact["strides"] = tuple(map(parse_stride, exact["strides"]))
-        for name, parse in (("frame_timeout", parse_duration), ("pre_forecaster_cost", parse_cost)):
-            if isinstance(exact.get(name), str):
-                exact[name] = parse(exact[name])
-        return cls(**exact)
+        values = {}
+        for each in fields(cls):
+            if each.name in settings:
+                value = settings.pop(each.name)
+                keep = value is None and each.default is None
+                values[each.name] = value if keep else named(each.name, _PARSERS[each.name], value)
+        if settings:
+            name = next(iter(settings))
+            raise TypeError(f"there is no setting {name!r}{hint(name, _PARSERS)}")
+        return cls(**values)
 
     @property
     def real_time(self) -> bool:
@@ -145,7 +161,7 @@ class ProfilePlan:
         return {each.name: str(getattr(self, each.name)) for each in fields(self)}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Profile:
     """What a profile left.
 
@@ -157,14 +173,38 @@ class Profile:
     traces: tuple[PassSummary, ...]
     failures: tuple[Failure, ...]
 
+    def to_frame(self) -> DataFrame:
+        """A row per trace: the attributes of :class:`lae_sim.profile.passes.PassSummary`."""
+        import pandas as pd
+
+        return pd.DataFrame([{**asdict(each), **each.schedule} for each in self.traces])
+
+    def __repr__(self) -> str:
+        if not self.traces:
+            return "<Profile: nothing was left to do>"
+        parts = [
+            f"{each.trace}: {each.sequences} sequence{'s' * (each.sequences != 1)}"
+            + ("" if each.median_ms is None else f", median {each.median_ms:.3g} ms")
+            for each in self.traces
+        ]
+        parts += [f"{len(self.failures)} failed"] * bool(self.failures)
+        return f"<Profile of {'; '.join(parts)}>"
+
+    def _repr_html_(self) -> str:
+        columns = ["trace", "kind", "timing", "sequences", "world_frames", "processed", "lost"]
+        times = ["init_ms", "median_ms", "p95_ms"]
+        table = self.to_frame().reindex(columns=[*columns, *times])
+        html: str = table.to_html(index=False, float_format="{:.2f}".format, na_rep="-")
+        failures = (f"{each.sequence}: {each.reason}" for each in self.failures)
+        return html + "".join(f"<p>failed: {escape(failure)}</p>" for failure in failures)
+
 
 def profile_tracker(
     tracker: str = "dcf",
     *,
-    out: str | Path | None = None,
+    out: str | os.PathLike[str] | None = None,
     resume: bool = False,
-    progress: Callable[[int, int], object] = lambda done, total: None,
-    notice: Callable[[str], object] = lambda text: None,
+    progress: bool | None = None,
     **settings: Any,
 ) -> Profile:
     """Run a tracker on this device and write a trace of each pass.
@@ -177,17 +217,62 @@ def profile_tracker(
         out: the first trace, ``.parquet``; further passes are written beside it. By default
             ``TRACKER-DATASET.parquet`` in the current folder.
         resume: whether to go on with a profile that was interrupted.
-        progress: ``progress(done, total)`` is called with world frames, before the first and after
-            each.
-        notice: called with each line that a user should read.
+        progress: whether to show a progress bar, and what a user should know besides; by default
+            on a terminal and in a notebook.
         settings: attributes of :class:`ProfilePlan`, as :meth:`ProfilePlan.of` takes them.
 
     Raises:
         LaeError: if something cannot be used, or no sequence could be profiled.
+
+    Example:
+        >>> import tempfile
+        >>> import lae_sim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     profile = lae_sim.profile_tracker(
+        ...         "dcf", sequences="race", out=f"{folder}/dcf.parquet", in_process=True
+        ...     )
+        ...     trace = lae_sim.read_trace(profile.traces[0].trace)
+        ...     len(trace["race"])
+        ...     profile
+        160
+        <Profile of .../dcf.parquet: 1 sequence, median ... ms>
     """
     plan = ProfilePlan.of(tracker=tracker, **settings)
+    if out is not None and not isinstance(out, (str, os.PathLike)):
+        raise LaeError(f"out: a path, not {shown(out)}")
+    with ProgressBar(tracker, "frames", progress) as bar:
+
+        def notice(text: str) -> None:
+            if bar.shown:
+                bar.close()
+                print(text, file=sys.stderr)
+
+        return run_profile(plan, out, resume=resume, progress=bar, notice=notice)
+
+
+def run_profile(
+    plan: ProfilePlan,
+    out: str | os.PathLike[str] | None = None,
+    *,
+    resume: bool = False,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+    notice: Callable[[str], object] = lambda text: None,
+) -> Profile:
+    """The same for a plan.
+
+    Args:
+        plan: what to measure.
+        out, resume: as of :func:`profile_tracker`.
+        progress: ``progress(done, total)`` is called with world frames, before the first and after
+            each.
+        notice: called with each line that a user should read.
+
+    Raises:
+        LaeError: as :func:`profile_tracker`.
+    """
     dataset = find_dataset(plan.dataset, plan.root, plan.sequences, plan.box, plan.fps)
-    path = _trace_path(out, f"{tracker}-{dataset.name}")
+    path = _trace_path(out, f"{plan.tracker}-{dataset.name}")
+    check_folders([str(path)])
     unfinished = path.with_suffix(".unfinished")
     if resume and path.exists() and not unfinished.exists():
         metadata = read_trace(path).metadata
@@ -244,13 +329,81 @@ def profile_tracker(
     return Profile(tuple(summary(task.path) for task in written), failed)
 
 
-def _trace_path(out: str | Path | None, name: str) -> Path:
+def _trace_path(out: str | os.PathLike[str] | None, name: str) -> Path:
     """The path of the first trace, by default of the name's letters and digits."""
     if out is None:
         return Path("".join(c if c.isalnum() or c in "-_" else "-" for c in name) + ".parquet")
     if not str(out).endswith(".parquet"):
-        raise LaeError(f"--out {out}: call the trace something.parquet")
+        raise LaeError(f"out {out}: call the trace something.parquet")
     return Path(out)
+
+
+def _path(value: Any) -> str:
+    """A path as text."""
+    return text(os.fspath(value) if isinstance(value, os.PathLike) else value)
+
+
+def _options(value: Any) -> Mapping[str, Any]:
+    if not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
+        raise LaeError(f"{shown(value)} is no mapping from names to values")
+    return value
+
+
+def _box(value: Any) -> tuple[float, ...]:
+    numbers = tuple(value.split(",") if isinstance(value, str) else several(value))
+    try:
+        x, y, w, h = map(float, numbers)
+    except (TypeError, ValueError) as error:
+        raise LaeError(f"{shown(value)} is no box x, y, w, h in pixels") from error
+    return x, y, w, h
+
+
+def _policy(value: Any) -> str:
+    """A policy's name, looked up before the tracker is started."""
+    parse_policy(text(value))
+    return text(value)
+
+
+def _timing(value: Any) -> str:
+    """Times as of :func:`.passes.parse_timing`, looked at before the tracker is started."""
+    kind, _, elapsed = _path(value).partition(":")
+    if kind == "constant":
+        parse_duration(elapsed)
+    else:
+        read_trace(_path(value))
+    return _path(value)
+
+
+def _each(parse: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, ...]]:
+    return lambda value: tuple(map(parse, several(value)))
+
+
+# setting -> how its value is read
+_PARSERS: Mapping[str, Callable[[Any], Any]] = {
+    "tracker": text,
+    "options": _options,
+    "translate": flag,
+    "python": _path,
+    "in_process": flag,
+    "threads": partial(whole, least=1),
+    "frame_timeout": parse_duration,
+    "warmup": whole,
+    "dataset": text,
+    "root": _path,
+    "sequences": sequence_names,
+    "box": _box,
+    "fps": parse_fps,
+    "mode": text,
+    "policy": _policy,
+    "pre_forecaster": text,
+    "pre_forecaster_cost": parse_cost,
+    "keep_size": flag,
+    "timing": _timing,
+    "strides": _each(parse_stride),
+    "closed_loops": _each(_timing),
+    "repeat": partial(whole, least=1),
+    "include_decode": flag,
+}
 
 
 def _start(plan: ProfilePlan, notice: Callable[[str], object]) -> TimedTracker:

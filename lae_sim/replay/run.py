@@ -16,7 +16,7 @@ from lae_sim.engine.lanes import simulate_lanes
 from lae_sim.engine.policies import latest
 from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
 from lae_sim.engine.times import Times
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, explained, shown
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
@@ -41,6 +41,13 @@ class Run:
         disagreement: share of processed frames where the box of the next lower or next higher
             stride overlaps less than half, 0 if the replay is exact, NaN without strided passes.
             Where it is high the tracker's luck depends on the frames that it sees.
+
+    Example:
+        >>> import lae_sim
+        >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
+        >>> run = next(iter(runs))
+        >>> run.recording.name, len(run), len(run.schedule.frames), run.departures
+        ('bike-pan', 300, 213, 86)
     """
 
     recording: Recording
@@ -78,7 +85,19 @@ def replay_sequence(
     Raises:
         LaeError: if a frame is asked for that the recording lacks, or the recordings differ in
             length; it names the sequence and the frame.
+
+    Example:
+        >>> import lae_sim
+        >>> from lae_sim.engine import Clock
+        >>> trace = lae_sim.read_trace("traces/synthetic-slow.parquet")
+        >>> run = lae_sim.replay_sequence(trace["boat-calm"], Clock.at(trace.metadata.fps))
+        >>> run.schedule.frames[:5].tolist(), run.boxes.shape == (len(run.schedule.frames), 4)
+        ([0, 8, 9, 10, 12], True)
     """
+    if not isinstance(recording, Recording):
+        raise LaeError(f"recording: one sequence, such as trace['car'], not {shown(recording)}")
+    if not isinstance(clock, Clock):
+        raise LaeError(f"clock: such as Clock.at(trace.metadata.fps), not {shown(clock)}")
     job = _Job(recording, recording if times is None else times, strided or {}, stride)
     return job.run(simulate(len(recording), clock, source(job.times), policy))
 
@@ -174,7 +193,15 @@ class Runs:
 
     Raises:
         LaeError: if two passes have the same stride; while one goes through the runs, if a
-            sequence or frame that is asked for is not there.
+            sequence or frame that is asked for is not there, or policy or source raise something.
+
+    Example:
+        >>> import lae_sim
+        >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
+        >>> runs
+        <Runs of <Trace of 'slow-and-accurate' on 'synthetic': 8 sequences, ...> at 30 fps>
+        >>> sum(len(run.schedule.frames) for run in runs) / runs.trace.frames
+        0.71
     """
 
     trace: Trace
@@ -193,7 +220,8 @@ class Runs:
     def __iter__(self) -> Iterator[Run]:
         frames = _GROUP_FRAMES if self.batch else 1
         for jobs in batched(_jobs(self.trace, self.timing, self.passes), frames):
-            services = [self.source(job.times) for job in jobs]
+            with explained("latency"):
+                services = [self.source(job.times) for job in jobs]
             yield from _replayed(jobs, self.clock, services, self.policy)
 
     def __repr__(self) -> str:
@@ -239,7 +267,10 @@ def _replayed(
     jobs: Sequence[_Job], clock: Clock, services: Sequence[Service], policy: Policy
 ) -> Iterator[Run]:
     schedules = simulate_lanes([len(job) for job in jobs], clock, services, policy)
-    return (job.run(schedule) for job, schedule in zip(jobs, schedules))
+    for job in jobs:
+        with explained(f"sequence {job.recording.name!r}: policy or latency"):
+            schedule = next(schedules)
+        yield job.run(schedule)
 
 
 def _jobs(trace: Trace, timing: Trace | None, strided: Sequence[Trace] = ()) -> Iterator[_Job]:

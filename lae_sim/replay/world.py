@@ -15,7 +15,8 @@ from typing import Any, TypeAlias, TypeVar
 from lae_sim.engine import policies
 from lae_sim.engine.clock import Clock, Number, exact, parse_fps, whole
 from lae_sim.engine.scheduler import Policy, scores_latency
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, hint, shown
+from lae_sim.files import sequence_names
 from lae_sim.plugins import bound, imported
 from lae_sim.replay import latency as sources
 from lae_sim.replay.latency import LatencySource, scaled
@@ -23,12 +24,24 @@ from lae_sim.replay.run import Runs
 from lae_sim.trace.file import Trace, read_trace
 
 SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
-"""The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames."""
+"""The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames.
+
+Example:
+    >>> import lae_sim
+    >>> len(lae_sim.SIGMA_GRID), lae_sim.SIGMA_GRID[1]
+    (51, Fraction(1, 50))
+    >>> lae_sim.World.of(sigma="grid").sigmas == lae_sim.SIGMA_GRID
+    True
+"""
 
 TraceLike: TypeAlias = "str | os.PathLike[str] | Trace"
 """An open trace, or the path or URL of one."""
 
 Value = TypeVar("Value")
+
+_PLUGIN: tuple[Any, ...] = (str, Callable)
+_TRACE = (str, os.PathLike, Trace)
+_A_TRACE = "a path, a URL or what read_trace gives"
 
 
 @dataclass(frozen=True)
@@ -50,6 +63,15 @@ class World:
 
     Raises:
         LaeError: if a value is impossible, or some do not go together.
+
+    Example:
+        >>> import lae_sim
+        >>> world = lae_sim.World.of(fps="30000/1001", latency="constant:47ms", scale=1.5)
+        >>> world.fps, world.scale, world.label()
+        (Fraction(30000, 1001), Fraction(3, 2), 'constant:47ms x 3/2')
+        >>> runs = world.replay("traces/synthetic-slow.parquet")
+        >>> next(iter(runs)).schedule.frames[:4].tolist()
+        [0, 2, 4, 6]
     """
 
     fps: Fraction | None = None
@@ -67,11 +89,20 @@ class World:
         for name in ("passes", "sigmas", "forecasters", "costs"):
             if not isinstance(getattr(self, name), tuple):
                 raise LaeError(f"{name} of a World is a tuple; World.of takes one value too")
+        _check_kinds("policy", [self.policy], _PLUGIN, "a name, such as 'latest', or a function")
+        latency = "a name, such as 'recorded' or 'constant:47ms', or a function"
+        _check_kinds("latency", [self.latency], _PLUGIN, latency)
+        traces = [*self.passes] if self.timing is None else [self.timing, *self.passes]
+        _check_kinds("timing and passes", traces, _TRACE, _A_TRACE)
+        _check_kinds("convention", [self.convention], (str,), "a name, such as 'pysot'")
+        _check_kinds("forecasters", self.forecasters, (str,), "a name, such as 'kalman'")
+        _check_kinds("costs", self.costs, (str,), "text, such as '2ms' or 'kalman=2ms'")
         if self.fps is not None:
             Clock.at(self.fps)
             if self.fps <= 0:
                 raise LaeError(f"fps: a frame rate must be above zero, not {self.fps}")
-        if not all(isinstance(each, (Fraction, int)) for each in (self.scale, *self.sigmas)):
+        numbers: tuple[object, ...] = (self.scale, *self.sigmas)
+        if not all(isinstance(n, (Fraction, int)) and not isinstance(n, bool) for n in numbers):
             raise LaeError("scale and sigmas of a World are exact; World.of takes text too")
         scaled(self.source(), self.scale)
         check_sigmas(self.sigmas)
@@ -106,9 +137,9 @@ class World:
         """
         return cls(
             fps=None if fps is None else named("fps", parse_fps, fps),
-            policy=policy,
-            latency=latency,
-            scale=named("scale", exact, scale),
+            policy=_checked("policy", policy, parse_policy),
+            latency=_checked("latency", latency, parse_latency),
+            scale=named("scale", _factor, scale),
             timing=timing,
             passes=several(passes),
             sigmas=named("sigma", parse_sigmas, sigma),
@@ -130,13 +161,25 @@ class World:
         """The worlds of every combination of some policies, rates, latencies and scales.
 
         Each is one value or several; the last varies fastest. ``others`` are as in :meth:`of`.
+
+        Raises:
+            LaeError: as :meth:`of`, or if there is nothing of one.
         """
-        lists = (several(policy), several(fps) or (None,), several(latency), several(scale))
-        worlds = (
-            cls.of(policy=rule, fps=rate, latency=source, scale=factor, **others)
-            for rule, rate, source, factor in product(*lists)
-        )
-        return tuple(dict.fromkeys(worlds))
+        swept = {
+            "policy": several(policy),
+            "fps": (None,) if fps is None else several(fps),
+            "latency": several(latency),
+            "scale": several(scale),
+        }
+        for name, values in swept.items():
+            if not values:
+                raise LaeError(f"{name}: name at least one")
+        worlds: list[World] = []
+        for values in product(*swept.values()):
+            world = cls.of(**dict(zip(swept, values)), **others)
+            if world not in worlds:  # a user's policy may have no hash
+                worlds.append(world)
+        return tuple(worlds)
 
     def rule(self) -> Policy:
         """The policy itself."""
@@ -152,20 +195,20 @@ class World:
         return name if self.scale == 1 else f"{name} x {self.scale}"
 
     def replay(
-        self, trace: TraceLike, sequences: Iterable[str] | None = None, batch: bool = False
+        self, trace: TraceLike, sequences: str | Iterable[str] | None = None, batch: bool = False
     ) -> Runs:
         """Replay a trace in this world.
 
         Args:
             trace: the boxes and the truth.
-            sequences: those to read, where traces are given by their paths; all by default.
+            sequences: those wanted; all by default.
             batch: schedule many sequences at once where policy and latency allow it (see
                 :func:`lae_sim.engine.lanes.batchable`). The runs are the same.
 
         Raises:
             LaeError: if a trace is missing or damaged, or the passes do not go together.
         """
-        names = None if sequences is None else frozenset(sequences)
+        names = None if sequences is None else sequence_names(sequences)
         opened = open_trace(trace, names)
         return Runs(
             opened,
@@ -207,25 +250,44 @@ def replay_trace(
         >>> import lae_sim
         >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
         >>> [len(run) for run in runs][:3]
-        [400, 400, 400]
+        [300, 300, 300]
     """
+    opened = named("trace", open_trace, trace)
     world = World.of(
-        fps=fps, policy=policy, latency=latency, scale=scale, timing=timing, passes=passes
+        fps=fps,
+        policy=policy,
+        latency=latency,
+        scale=scale,
+        **open_others(timing, passes),
     )
-    return world.replay(trace, batch=batch)
+    return world.replay(opened, batch=batch)
 
 
 def open_trace(trace: TraceLike, sequences: Iterable[str] | None = None) -> Trace:
-    """The trace, opened if it is not yet.
+    """The trace, opened if it is not yet; with some of its sequences only, if they are named.
 
     Raises:
-        LaeError: if it is neither a trace nor a path, or cannot be opened.
+        LaeError: if it is neither a trace nor a path, cannot be opened, or lacks a sequence.
     """
     if isinstance(trace, Trace):
-        return trace
+        return trace if sequences is None else trace.chosen(sequences)
     if not isinstance(trace, (str, os.PathLike)):
-        raise LaeError(f"a trace is a path, a URL or what read_trace gives, not {trace!r:.60}")
-    return read_trace(trace, None if sequences is None else frozenset(sequences))
+        raise LaeError(f"a trace is {_A_TRACE}, not {shown(trace)}")
+    return read_trace(trace, sequences)
+
+
+def open_others(
+    timing: TraceLike | None, passes: TraceLike | Iterable[TraceLike]
+) -> dict[str, Any]:
+    """The traces of times and passes, opened, as arguments of :meth:`World.of`.
+
+    Raises:
+        LaeError: as :func:`open_trace`; it names the argument.
+    """
+    return {
+        "timing": None if timing is None else named("timing", open_trace, timing),
+        "passes": tuple(named("passes", open_trace, each) for each in several(passes)),
+    }
 
 
 def parse_policy(text: str) -> Policy:
@@ -253,6 +315,7 @@ def parse_policy(text: str) -> Policy:
     raise LaeError(
         f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
         "vot-realtime[:GRACE], package.module:object"
+        + hint(name, ("latest", "fifo", "every", "shrinking-tail", "vot-realtime"))
     )
 
 
@@ -284,6 +347,7 @@ def parse_latency(text: str) -> LatencySource:
     raise LaeError(
         f"no latency {text!r}: there are recorded, by-call, constant:47ms, resample:SEED, "
         "lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object"
+        + hint(name, ("recorded", "by-call", "constant", "resample", "lognormal", "bootstrap"))
     )
 
 
@@ -304,7 +368,9 @@ def check_sigmas(sigmas: tuple[Fraction, ...]) -> None:
     Raises:
         LaeError: if they are not ascending, each of them once.
     """
-    if list(sigmas) != sorted(set(sigmas)) or not sigmas:
+    if not sigmas:
+        raise LaeError("sigma: name at least one permitted latency, such as 0 or 'grid'")
+    if list(sigmas) != sorted(set(sigmas)):
         raise LaeError("sigma: permitted latencies must be ascending, each of them once")
 
 
@@ -312,8 +378,30 @@ def several(value: Any) -> tuple[Any, ...]:
     """One value, or several, as a tuple; None is none. Text, a trace, a function are one value."""
     if value is None:
         return ()
-    one = isinstance(value, (str, os.PathLike, Trace)) or not isinstance(value, Iterable)
+    one = isinstance(value, (str, bytes, os.PathLike, Trace)) or not isinstance(value, Iterable)
     return (value,) if one else tuple(value)
+
+
+def text(value: Any) -> str:
+    """Text that is not empty.
+
+    Raises:
+        LaeError: if the value is none.
+    """
+    if not isinstance(value, str) or not value:
+        raise LaeError(f"{shown(value)} is not text")
+    return value
+
+
+def flag(value: Any) -> bool:
+    """True or false.
+
+    Raises:
+        LaeError: if the value is neither.
+    """
+    if not isinstance(value, bool):
+        raise LaeError(f"{shown(value)} is neither true nor false")
+    return value
 
 
 def named(name: str, parse: Callable[[Any], Value], value: Any) -> Value:
@@ -325,7 +413,23 @@ def named(name: str, parse: Callable[[Any], Value], value: Any) -> Value:
     try:
         return parse(value)
     except LaeError as error:
-        raise LaeError(f"{name}: {error}") from error
+        if str(error).startswith(f"{name}: "):
+            raise
+        raise type(error)(f"{name}: {error}") from error
+
+
+def _checked(name: str, plugin: Value, parse: Callable[[str], object]) -> Value:
+    """A policy or a source of times, of which a name has been looked up."""
+    if isinstance(plugin, str):
+        named(name, parse, plugin)
+    return plugin
+
+
+def _factor(value: Number) -> Fraction:
+    factor = exact(value)
+    if factor < 0:
+        raise LaeError(f"times cannot be scaled by {factor}, below zero")
+    return factor
 
 
 def label_of(plugin: object) -> str:
@@ -346,6 +450,12 @@ def _number(text: str, value: str, least: int = 0) -> int:
         return whole(value, least)
     except LaeError as error:
         raise LaeError(f"{text!r} needs a whole number from {least} after the colon") from error
+
+
+def _check_kinds(name: str, values: Iterable[object], kinds: tuple[type, ...], what: str) -> None:
+    for value in values:
+        if not isinstance(value, kinds):
+            raise LaeError(f"{name}: {shown(value)} is not {what}")
 
 
 RECORDED = World()

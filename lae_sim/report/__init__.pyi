@@ -1,5 +1,5 @@
 from .comparison import comparison_table
-from .figures import draw_curves, success_and_precision, sweep_figure, timeline
+from .figures import draw_curves, success_and_precision, sweep_figure, timeline_figure
 from .film import Scene, draw_frame, film_strip
 from .page import write_report
 from .study_tables import write_tables
@@ -15,7 +15,7 @@ __all__ = [
     "film_strip",
     "success_and_precision",
     "sweep_figure",
-    "timeline",
+    "timeline_figure",
     "write_report",
     "write_tables",
 ]

@@ -237,7 +237,7 @@ def sweep_figure(
 
 
 @styled
-def timeline(
+def timeline_figure(
     run: Run,
     sigma: Fraction = Fraction(0),
     first: int = 0,

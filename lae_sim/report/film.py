@@ -136,6 +136,17 @@ class Scene:
         run: the replayed sequence.
         images: the same sequence's frames.
         answers: what each forecaster answers for every world frame, by name.
+
+    Example:
+        >>> import lae_sim
+        >>> images = lae_sim.find_dataset(sequences="car").sequences[0]
+        >>> times = [47_000_000] * len(images)
+        >>> recording = lae_sim.Recording.new("car", images.truth, images.truth, times)
+        >>> trace = lae_sim.Trace(lae_sim.Metadata.new(30, "every-frame"), [recording])
+        >>> run = next(iter(lae_sim.replay_trace(trace)))
+        >>> scene = lae_sim.Scene.of(run, images, trace.metadata, {"hold": lae_sim.Hold})
+        >>> scene.draw(20).shape
+        (408, 640, 3)
     """
 
     run: Run

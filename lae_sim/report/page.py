@@ -84,6 +84,17 @@ def write_report(results: StudyResults | View, path: str | os.PathLike[str]) -> 
 
     Raises:
         LaeError: if the file cannot be written.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> import lae_sim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     results = lae_sim.run_study(
+        ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
+        ...     )
+        ...     lae_sim.write_report(results, f"{folder}/page.html")
+        ...     print(pathlib.Path(folder, "page.html").read_text().split()[0])
+        <!DOCTYPE
     """
     with written_whole(path) as temporary:
         view = results if isinstance(results, View) else View(results)

@@ -323,6 +323,17 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
 
     Raises:
         LaeError: if a file cannot be written.
+
+    Example:
+        >>> import os, tempfile
+        >>> import lae_sim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     results = lae_sim.run_study(
+        ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
+        ...     )
+        ...     lae_sim.write_tables(results, f"{folder}/paper")
+        ...     sorted(name for name in os.listdir(f"{folder}/paper") if name.endswith("tex"))
+        ['attributes.tex', 'ranking.tex', 'table2.tex']
     """
     view = results if isinstance(results, View) else View(results)
     results = view.results

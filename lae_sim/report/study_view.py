@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.comparison.statistics import by_attribute
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
 from lae_sim.report.table import printable
 from lae_sim.study.records import MEAN, Comparison, Requirement, SummaryRow
 from lae_sim.study.summary import Scores
@@ -48,6 +48,12 @@ class View:
     """
 
     results: StudyResults
+
+    def __post_init__(self) -> None:
+        from lae_sim.study.run import StudyResults
+
+        if not isinstance(self.results, StudyResults):
+            raise LaeError(f"results: what run_study gives, not {shown(self.results)}")
 
     @cached_property
     def rows(self) -> list[SummaryRow]:

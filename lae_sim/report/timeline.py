@@ -60,14 +60,15 @@ def timeline_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Itera
         )
     if any(costs.values()):
         raise LaeError(f"the picture {path} cannot show what forecasters cost: name a .json file")
-    from lae_sim.report.figures import timeline
+    from lae_sim.report.figures import timeline_figure
     from lae_sim.report.style import save
 
     pictures: list[Figure] = []
 
     def draw_first(scored: ScoredRun) -> None:
         if not pictures:
-            pictures.append(timeline(scored.run, sigma, pairing=scored.pairing(sigma)))
+            picture = timeline_figure(scored.run, sigma, pairing=scored.pairing(sigma))
+            pictures.append(picture)
 
     yield draw_first
     save(pictures[0], path)

@@ -45,6 +45,22 @@ class StudyResults:
         computed: how many cells were computed now, and not found finished.
         failures: what could not be computed, and why.
         training: what to say of the forecasters that were trained.
+
+    Example:
+        >>> import tempfile
+        >>> import lae_sim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     results = lae_sim.run_study(
+        ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
+        ...     )
+        ...     results.to_frame().shape
+        (16, 29)
+        >>> results
+        <StudyResults of 2 settings, 2 cells in ...>
+        >>> results.summary_frame()[["forecaster", "auc", "vs_hold_auc"]].round(3)
+          forecaster    auc  vs_hold_auc
+        0       hold  0.572          NaN
+        1     kalman  0.629        0.057
     """
 
     folder: Path

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import difflib
+import os
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from lae_sim.engine.clock import exact, parse_fps
+from lae_sim.engine.clock import exact, parse_fps, whole
 from lae_sim.engine.scheduler import scores_latency
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.replay.world import (
     check_sigmas,
+    flag,
     named,
     parse_latency,
     parse_policy,
     parse_sigmas,
+    several,
+    text,
 )
+from lae_sim.trace.file import Trace
 
 RANDOM = ("bootstrap", "resample", "lognormal")
 """Latencies that are drawn anew in each repetition."""
@@ -52,6 +58,15 @@ class Study:
         block: consecutive calls that the bootstrap of latencies keeps together.
         folds: of the training, where a forecaster is trained.
         require_auc: AUC for which the needed speed is looked for; None = not looked for.
+
+    Raises:
+        LaeError: if a value is impossible; it names the key of the file.
+
+    Example:
+        >>> import lae_sim
+        >>> study = lae_sim.Study(traces="traces/*.parquet", scales=[0.5, 1], sigmas="grid")
+        >>> study.traces, study.scales, len(study.sigmas)
+        (('traces/*.parquet',), (Fraction(1, 2), Fraction(1, 1)), 51)
     """
 
     traces: tuple[str, ...]
@@ -73,12 +88,10 @@ class Study:
     require_auc: Fraction | None = None
 
     def __post_init__(self) -> None:
-        for key, (name, parse) in _KEYS.items():
-            value = getattr(self, name)
-            if not isinstance(value, tuple) and value is not None:  # as plain as in a file
-                object.__setattr__(self, name, named(key, parse, value))
-        if not self.traces:
-            raise LaeError("traces: a study needs at least one trace")
+        for each in fields(self):
+            value, (key, parse) = getattr(self, each.name), _PARSERS[each.name]
+            if value is not each.default:  # as plain as in a file
+                object.__setattr__(self, each.name, named(key, parse, value))
         if self.repetitions > 1_000_000:
             raise LaeError(f"repetitions: {self.repetitions} are too many: at most a million")
         for latency in self.latencies:
@@ -128,24 +141,35 @@ class Study:
         return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
 
 
-def read_study(path: str) -> Study:
+def read_study(path: str | os.PathLike[str]) -> Study:
     """Read a study from a TOML file; local traces are relative to its folder.
+
+    Args:
+        path: of the file.
 
     Raises:
         LaeError: if it cannot be read, is not TOML, or is no valid study.
+
+    Example:
+        >>> import lae_sim
+        >>> study = lae_sim.read_study("traces/study.toml")
+        >>> study.traces, study.latencies
+        (('synthetic-slow.parquet', 'synthetic-fast.parquet'), ('recorded', 'bootstrap'))
     """
     if sys.version_info >= (3, 11):
         import tomllib
     else:
         import tomli as tomllib
 
+    if not isinstance(path, (str, os.PathLike)):
+        raise LaeError(f"path: a study is read from a TOML file, not {shown(path)}")
     try:
-        text = Path(path).read_text("utf-8")
+        content = Path(path).read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise LaeError(f"{path}: cannot be read: {error}") from error
     try:
         # numbers stay as they are written: no float comes between
-        document = tomllib.loads(text, parse_float=str)
+        document = tomllib.loads(content, parse_float=str)
         return Study.of(document)
     except (tomllib.TOMLDecodeError, LaeError) as error:
         raise LaeError(f"{path}: {error}") from error
@@ -177,14 +201,16 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Fraction) else value
 
 
-def _text(value: Any) -> str:
-    if not isinstance(value, str) or not value:
-        raise LaeError(f"{value!r} is not text")
-    return value
+def _trace(value: Any) -> str:
+    """The path or URL of a trace; an open one has to have been read from there."""
+    path = getattr(value.recordings, "path", value) if isinstance(value, Trace) else value
+    if isinstance(path, Trace):
+        raise LaeError(f"{shown(value)} is in memory: write it first, with write_trace")
+    return text(os.fspath(path) if isinstance(path, os.PathLike) else path)
 
 
 def _rate(value: Any) -> Fraction | None:
-    return None if value == "trace" else parse_fps(value)
+    return None if value is None or value == "trace" else parse_fps(value)
 
 
 def _sigmas(value: Any) -> tuple[Fraction, ...]:
@@ -195,7 +221,7 @@ def _several(parse: Callable[[Any], Value]) -> Callable[[Any], tuple[Value, ...]
     """A list of values, or one value; each once."""
 
     def parsed(value: Any) -> tuple[Value, ...]:
-        values = value if isinstance(value, (list, tuple)) else [value]
+        values = [value] if isinstance(value, Mapping) or value is None else several(value)
         if not values:
             raise LaeError("the list is empty: leave the key out, or name something")
         return tuple(dict.fromkeys(map(parse, values)))
@@ -203,38 +229,24 @@ def _several(parse: Callable[[Any], Value]) -> Callable[[Any], tuple[Value, ...]
     return parsed
 
 
-def _whole(least: int) -> Callable[[Any], int]:
-    def parsed(value: Any) -> int:
-        if type(value) is not int or not least <= value < 2**63:
-            raise LaeError(f"{value!r} is not a whole number from {least}")
-        return value
-
-    return parsed
-
-
-def _flag(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise LaeError(f"{value!r} is neither true nor false")
-    return value
-
-
 # key of the file -> (attribute, how its value is read)
 _KEYS: Mapping[str, tuple[str, Callable[[Any], Any]]] = {
-    "traces": ("traces", _several(_text)),
-    "timing": ("timing", _several(_text)),
-    "forecasters": ("forecasters", _several(_text)),
-    "policies": ("policies", _several(_text)),
+    "traces": ("traces", _several(_trace)),
+    "timing": ("timing", _several(_trace)),
+    "forecasters": ("forecasters", _several(text)),
+    "policies": ("policies", _several(text)),
     "fps": ("fps", _several(_rate)),
-    "latencies": ("latencies", _several(_text)),
+    "latencies": ("latencies", _several(text)),
     "scales": ("scales", _several(exact)),
     "sigma": ("sigmas", _sigmas),
-    "conventions": ("conventions", _several(_text)),
-    "costs": ("costs", _several(_text)),
-    "sequences": ("sequences", _several(_text)),
-    "attributes": ("attributes", _flag),
-    "repetitions": ("repetitions", _whole(1)),
-    "seed": ("seed", _whole(0)),
-    "block": ("block", _whole(1)),
-    "folds": ("folds", _whole(2)),
+    "conventions": ("conventions", _several(text)),
+    "costs": ("costs", _several(text)),
+    "sequences": ("sequences", _several(text)),
+    "attributes": ("attributes", flag),
+    "repetitions": ("repetitions", partial(whole, least=1)),
+    "seed": ("seed", whole),
+    "block": ("block", partial(whole, least=1)),
+    "folds": ("folds", partial(whole, least=2)),
     "require_auc": ("require_auc", exact),
 }
+_PARSERS = {name: (key, parse) for key, (name, parse) in _KEYS.items()}

@@ -7,7 +7,7 @@ the file, and a trace is written whole or not at all. Nothing in a trace is ever
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim.errors import LaeError, TraceError
-from lae_sim.files import written_whole
+from lae_sim.errors import LaeError, TraceError, hint, shown
+from lae_sim.files import sequence_names, written_whole
 from lae_sim.trace.checks import COLUMN_TYPES, RowChecker, check_schema
 from lae_sim.trace.columns import BOX, TRUTH, Rows, checksums
 from lae_sim.trace.locate import is_url, opened
@@ -26,7 +26,7 @@ from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
 HELD_FRAMES = 1 << 18
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trace:
     """A trace: its metadata, and its recordings sorted by name.
 
@@ -62,30 +62,42 @@ class Trace:
     def names(self) -> tuple[str, ...]:
         """The names of the sequences, sorted."""
         if isinstance(self.recordings, _StoredRecordings):
-            return self.recordings.names()
+            return tuple(self.recordings.lengths())
         return tuple(recording.name for recording in self.recordings)
+
+    def chosen(self, sequences: str | Iterable[str]) -> Trace:
+        """The trace with some of its sequences only; of a file their names alone are read.
+
+        Raises:
+            LaeError: if none is named, or one is not there.
+        """
+        keep = frozenset(sequence_names(sequences))
+        if isinstance(self.recordings, _StoredRecordings):
+            if keep == self.recordings.keep:
+                return self
+            stored = self.recordings.only(keep)
+            return replace(self, recordings=stored, frames=sum(stored.lengths().values()))
+        kept = [recording for recording in self.recordings if recording.name in keep]
+        if missing := keep.difference(recording.name for recording in kept):
+            raise LaeError(f"the trace has no sequence {_listed(missing, self.names)}")
+        return replace(self, recordings=kept, frames=sum(map(len, kept)))
 
     def __len__(self) -> int:
         """Number of sequences."""
         return len(self.names)
 
     def __getitem__(self, name: str) -> Recording:
-        if isinstance(self.recordings, _StoredRecordings):
-            return next(iter(self.recordings.only(name)))
-        for recording in self.recordings:
-            if recording.name == name:
-                return recording
-        raise LaeError(f"the trace has no sequence {name!r}: there are {', '.join(self.names[:9])}")
+        return next(iter(self.chosen([name])))
 
     def __repr__(self) -> str:
-        about = f"{len(self):,} sequences"
-        if self.frames is not None and getattr(self.recordings, "keep", None) is None:
+        about = f"{len(self):,} sequence{'s' * (len(self) != 1)}"
+        if self.frames is not None:
             about += f", {self.frames:,} frames"
         tracker, dataset = self.metadata.tracker, self.metadata.dataset
         return f"<Trace of {tracker!r} on {dataset!r}: {about} at {self.metadata.fps} fps>"
 
 
-def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None = None) -> Trace:
+def read_trace(path: str | os.PathLike[str], sequences: str | Iterable[str] | None = None) -> Trace:
     """Open a trace; the recordings are read and checked while one iterates over them.
 
     Args:
@@ -95,10 +107,20 @@ def read_trace(path: str | os.PathLike[str], sequences: Collection[str] | None =
     Raises:
         TraceError: here or during iteration, if the file is not a valid trace; it names the file,
             column, sequence and frame, and the likely cause.
+        LaeError: if a sequence that is named is not there.
+
+    Example:
+        >>> import lae_sim
+        >>> trace = lae_sim.read_trace("traces/synthetic-slow.parquet", sequences="boat-calm")
+        >>> [(recording.name, len(recording)) for recording in trace]
+        [('boat-calm', 300)]
     """
-    stored = _StoredRecordings(os.fspath(path), None if sequences is None else frozenset(sequences))
+    if not isinstance(path, (str, os.PathLike)):
+        raise LaeError(f"path: a trace is read from a path or a URL, not {shown(path)}")
+    stored = _StoredRecordings(os.fspath(path))
     metadata, rows = stored.describe()
-    return Trace(metadata, replace(stored, profiled=metadata.profiled), rows)
+    trace = Trace(metadata, replace(stored, profiled=metadata.profiled), rows)
+    return trace if sequences is None else trace.chosen(sequences)
 
 
 def held(trace: Trace, frames: int = HELD_FRAMES) -> Trace:
@@ -117,6 +139,14 @@ def validate(path: str | os.PathLike[str]) -> None:
 
     Raises:
         TraceError: at the first fault.
+
+    Example:
+        >>> import lae_sim
+        >>> lae_sim.validate("traces/synthetic-slow.parquet")
+        >>> lae_sim.validate("traces/cases/invalid/time-negative.parquet")
+        Traceback (most recent call last):
+        ...
+        lae_sim.errors.TraceError: ... column 'elapsed_ns', sequence 'a', frame 3: negative time ...
     """
     for _ in read_trace(path):
         pass
@@ -128,10 +158,21 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
     Raises:
         TraceError: if the recordings are not sorted by name or break the format.
         LaeError: if the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> import lae_sim
+        >>> slow = lae_sim.read_trace("traces/synthetic-slow.parquet")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     lae_sim.write_trace(slow.chosen("boat-calm"), f"{folder}/one.parquet")
+        ...     lae_sim.read_trace(f"{folder}/one.parquet")
+        <Trace of 'slow-and-accurate' on 'synthetic': 1 sequence, 300 frames at 30 fps>
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    if not isinstance(trace, Trace) or not isinstance(path, (str, os.PathLike)):
+        raise LaeError(f"write_trace takes a trace and a path, not {shown(trace)}, {shown(path)}")
     types = {**COLUMN_TYPES, "score": "float32"}
     schema = pa.schema(
         [pa.field(name, types[name], nullable=name not in ("sequence", "frame")) for name in types],
@@ -171,7 +212,7 @@ class _StoredRecordings:
     """The recordings of a file, read anew on each iteration."""
 
     path: str
-    keep: frozenset[str] | None
+    keep: frozenset[str] | None = None
     profiled: bool = False
 
     def describe(self) -> tuple[Metadata, int]:
@@ -189,26 +230,34 @@ class _StoredRecordings:
             except TraceError as error:
                 raise TraceError(f"{self.path}: {error}") from error
 
-    def names(self) -> tuple[str, ...]:
-        """The names of the sequences that are kept, sorted; no other column is read."""
-        found: dict[str, None] = {}
-        with self._opened() as file:
-            for batch in file.iter_batches(2 * BATCH_ROWS, columns=["sequence"], use_threads=False):
-                found.update(dict.fromkeys(batch.column(0).dictionary.to_pylist()))
-        if self.keep is not None and not self.keep <= found.keys():
-            missing = sorted(self.keep - found.keys())
-            raise LaeError(f"{self.path}: no sequence {', '.join(map(repr, missing))}")
-        return tuple(sorted(found if self.keep is None else self.keep))
-
-    def only(self, name: str) -> _StoredRecordings:
-        """One sequence alone.
+    def lengths(self) -> dict[str, int]:
+        """World frames of each sequence that is kept, by name, sorted; no other column is read.
 
         Raises:
-            LaeError: if it is not there, or is not kept.
+            LaeError: if one that is to be kept is not there.
         """
-        if self.keep is not None and name not in self.keep:
-            raise LaeError(f"{self.path}: no sequence {name!r} of those chosen")
-        return replace(self, keep=frozenset([name]))
+        found: dict[str, int] = {}
+        with self._opened() as file:
+            for batch in file.iter_batches(2 * BATCH_ROWS, columns=["sequence"], use_threads=False):
+                for each in batch.column(0).value_counts().to_pylist():
+                    found[each["values"]] = found.get(each["values"], 0) + each["counts"]
+        found.pop(None, None)  # type: ignore[call-overload]  # a fault that reading will find
+        if self.keep is not None:
+            if missing := self.keep - found.keys():
+                raise LaeError(f"{self.path}: no sequence {_listed(missing, found)}")
+            found = {name: found[name] for name in self.keep}
+        return dict(sorted(found.items()))
+
+    def only(self, names: frozenset[str]) -> _StoredRecordings:
+        """Some of the sequences.
+
+        Raises:
+            LaeError: if one is not among those that are kept.
+        """
+        if self.keep is not None and not names <= self.keep:
+            missing = _listed(names - self.keep, self.keep)
+            raise LaeError(f"{self.path}: of those chosen, no sequence {missing}")
+        return replace(self, keep=names)
 
     def __iter__(self) -> Iterator[Recording]:
         missing = set(self.keep or ())
@@ -217,7 +266,7 @@ class _StoredRecordings:
                 missing.discard(recording.name)
                 yield recording
         if missing:
-            raise LaeError(f"{self.path}: no sequence {', '.join(map(repr, sorted(missing)))}")
+            raise LaeError(f"{self.path}: no sequence {_listed(missing)}")
 
     def _all(self) -> Iterator[Recording]:
         """Recordings, put together again where a batch ends inside one."""
@@ -269,11 +318,19 @@ class _StoredRecordings:
                 f"{self.path}: column 'sequence' is missing: is this a lae_sim trace?"
             ) from error
         except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+            if not is_url(self.path) and not os.path.lexists(self.path):
+                raise TraceError(f"{self.path}: no such file") from error  # constant:47ms, too
             raise TraceError(f"{self.path}: not a readable Parquet file: {error}") from error
         except Exception as error:
             if isinstance(error, LaeError) or not is_url(self.path):
                 raise
             raise TraceError(f"{self.path}: {type(error).__name__}: {error}") from error
+
+
+def _listed(missing: Iterable[str], known: Iterable[str] = ()) -> str:
+    """Sequences that are not there, with what may have been meant by one."""
+    names = sorted(missing, key=str)
+    return ", ".join(map(repr, names)) + (hint(names[0], known) if len(names) == 1 else "")
 
 
 def _joined(parts: list[Recording]) -> Recording:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.engine.scheduler import Schedule
+from lae_sim.errors import LaeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +24,14 @@ class Recording:
         boxes: the tracker's boxes, float64 [T, 4]; NaN = frame not processed.
         elapsed_ns: processing times in ns, int64 [T]; -1 = frame not processed.
         score: the tracker's confidence, float32 [T]; NaN = none.
+
+    Example:
+        >>> import lae_sim
+        >>> truth = [[10, 20, 30, 40], [12, 20, 30, 40]]
+        >>> boxes = [[10, 20, 30, 40], [11, 20, 30, 40]]
+        >>> recording = lae_sim.Recording.new("car", truth, boxes, [5_000_000, 47_000_000])
+        >>> len(recording), recording.elapsed_ns.tolist()
+        (2, [5000000, 47000000])
     """
 
     name: str
@@ -47,20 +56,26 @@ class Recording:
         """A recording from anything array-like (not copied); ``score`` defaults to none.
 
         Raises:
-            ValueError: if the lengths differ.
+            LaeError: if the lengths differ, or something is not made of numbers.
         """
-        times = np.asarray(elapsed_ns, np.int64)
-        no_score = np.full(len(times), np.nan, np.float32)
-        recording = cls(
-            name,
-            np.asarray(truth, np.float64).reshape(-1, 4),
-            np.asarray(boxes, np.float64).reshape(-1, 4),
-            times,
-            no_score if score is None else np.asarray(score, np.float32),
-        )
+        try:
+            with np.errstate(invalid="ignore"):
+                times = np.asarray(elapsed_ns, np.int64)
+            if not np.array_equal(times, elapsed_ns):
+                raise LaeError(f"{name}: elapsed_ns: times are whole nanoseconds")
+            no_score = np.full(len(times), np.nan, np.float32)
+            recording = cls(
+                name,
+                np.asarray(truth, np.float64).reshape(-1, 4),
+                np.asarray(boxes, np.float64).reshape(-1, 4),
+                times,
+                no_score if score is None else np.asarray(score, np.float32),
+            )
+        except (TypeError, ValueError) as error:
+            raise LaeError(f"{name}: not boxes [T, 4] and times in ns [T]: {error}") from error
         lengths = {len(recording.truth), len(recording.boxes), len(times), len(recording.score)}
         if len(lengths) != 1:
-            raise ValueError(f"{name}: truth, boxes, times and scores differ in length: {lengths}")
+            raise LaeError(f"{name}: truth, boxes, times and scores differ in length: {lengths}")
         return recording
 
     @classmethod

@@ -309,7 +309,7 @@ def test_a_full_disk_is_an_error_and_leaves_no_trace(here: Path) -> None:
         ((*MINE, "--timing", "constant:47"), "unit"),
         ((*MINE, "--stride", "1"), "above 1"),
         ((*MINE, "--stride", "two"), "exact number"),
-        ((*MINE, "--translate"), "pre-forecaster"),
+        ((*MINE, "--translate"), "pre_forecaster"),
         ((*MINE, "--pre-forecaster", "crystal-ball"), "crystal-ball"),
         ((*MINE, "--out", "trace.txt"), "parquet"),
         ((*MINE, "--out", "no/folder/t.parquet"), "no/folder"),

@@ -10,7 +10,7 @@ import pytest
 
 from lae_sim.comparison.fidelity import compare_closed_loops, summarise_closed_loops
 from lae_sim.errors import LaeError
-from lae_sim.profile.run import ProfilePlan, profile_tracker
+from lae_sim.profile.run import ProfilePlan, run_profile
 from lae_sim.trace.file import read_trace
 
 QUICK = {"sequences": ["race"], "in_process": True, "warmup": 0}
@@ -39,10 +39,10 @@ def test_text_and_numbers_make_a_plan() -> None:
         ({"strides": [1]}, "above 1"),
         ({"fps": 0}, "above zero"),
         ({"frame_timeout": "30"}, "unit"),
-        ({"mode": "fast"}, "no mode 'fast'"),
+        ({"mode": "fast"}, "mode: no 'fast': there are every-frame and real-time"),
         ({"mode": "every-frame", "policy": "fifo"}, "real-time"),
         ({"mode": "real-time", "strides": [2]}, "every-frame"),
-        ({"keep_size": True}, "pre-forecaster"),
+        ({"keep_size": True}, "pre_forecaster"),
     ],
 )
 def test_settings_that_cannot_be(settings: dict[str, Any], message: str) -> None:
@@ -55,13 +55,11 @@ def test_passes_progress_and_closed_loops(tmp_path: Path) -> None:
     notices: list[str] = []
     out = tmp_path / "t.parquet"
     out.write_bytes(b"")
-    profile = profile_tracker(
-        "dcf",
-        out=out,
+    profile = run_profile(
+        ProfilePlan.of(tracker="dcf", closed_loops=["constant:100ms"], **QUICK),
+        out,
         progress=lambda done, total: progress.append((done, total)),
         notice=notices.append,
-        closed_loops=["constant:100ms"],
-        **QUICK,
     )
     assert notices == [f"{out} will be replaced"]
     frames = len(next(iter(read_trace(out))))
@@ -82,5 +80,5 @@ def test_passes_progress_and_closed_loops(tmp_path: Path) -> None:
         assert summary.auc == row.auc
         assert summary.median_abs_d_auc == abs(row.d_auc)
     notices.clear()
-    assert profile_tracker("dcf", out=out, resume=True, notice=notices.append).traces == ()
+    assert run_profile(ProfilePlan(), out, resume=True, notice=notices.append).traces == ()
     assert "nothing to resume" in notices[0]

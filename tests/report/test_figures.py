@@ -60,7 +60,7 @@ def test_success_and_precision_draws_a_line_for_each_curve(trace):
 
 def test_timeline_shows_frames_and_who_answers_them(trace):
     run = next(iter(lae_sim.replay_trace(trace)))
-    figure = plots.timeline(run, first=20, count=10)
+    figure = plots.timeline_figure(run, first=20, count=10)
     [axes] = figure.axes
     written = [text.get_text() for text in axes.texts]
     pairing = pair([run.schedule], [Fraction(0)])
