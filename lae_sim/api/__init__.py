@@ -4,6 +4,6 @@ The functions here hold no logic of replaying and scoring: they open traces, mak
 :class:`lae_sim.replay.world.World` of their arguments, and hand both to the rooms below.
 """
 
-import lazy_loader
+from lae_sim._faces import lazy_face
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -183,7 +183,9 @@ def compare_forecasters(
             "forecasters: offline is always in the table: the tracker's own boxes, without latency"
         )
     check_frames(makers, root)
-    folds = named("folds", partial(whole, least=2), folds)
+    folds = named("folds", whole, folds)
+    if folds < 2:
+        raise LaeError("folds: training on some sequences to score others needs at least two folds")
     seed = named("seed", whole, seed)
     kinds = {(trace.metadata.dataset, trace.metadata.fps) for trace in opened.values()}
     if root is not None and len(kinds) > 1:

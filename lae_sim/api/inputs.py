@@ -162,7 +162,7 @@ def check_frames(forecasters: Mapping[str, Any], root: object) -> None:
     """
     for each in forecasters.values():
         if root is None and isinstance(each, str) and each.startswith("camera+"):
-            raise LaeError(f"root: {each} needs the frames: give the dataset's folder")
+            raise LaeError(f"root: {each} needs the frames: give the dataset's folder with --root")
 
 
 def camera_of(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,19 +14,15 @@ from lae_sim.cli.options import (
     argument,
     exit_status,
     new_parser,
-    worlds_of,
 )
 from lae_sim.engine.clock import parse_rational, whole
 from lae_sim.errors import LaeError
-from lae_sim.files import check_distinct, check_folders, labels
-from lae_sim.learning.registry import FORECASTERS, find_camera, load_any
+from lae_sim.files import check_distinct, check_folders
+from lae_sim.learning.registry import FORECASTERS
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from lae_sim.forecast.base import AnyFactory
-    from lae_sim.learning.folds import Trainer
-    from lae_sim.trace.file import Trace
 
 PROGRAM = "lae-sim compare"
 
@@ -92,32 +88,68 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    from lae_sim.trace.file import read_trace
+    import json
+
+    from lae_sim import __version__
+    from lae_sim.api.comparison import compare_forecasters
+    from lae_sim.report.comparison import comparison_table
     from lae_sim.trace.locate import find_traces
 
-    arguments.traces = paths = find_traces(arguments.traces)
-    _check(arguments)
-    traces = {
-        label: read_trace(path, arguments.sequence) for path, label in zip(paths, labels(paths))
-    }
-    forecasters = _forecasters(arguments, traces)
-    table = _table(arguments, traces, forecasters)
+    paths = find_traces(arguments.traces)
+    _check_files(arguments, paths)
+    result = compare_forecasters(
+        paths,
+        forecasters=arguments.forecaster,
+        sigma="grid" if arguments.sigma_grid else arguments.sigma,
+        latency=arguments.latency,
+        scale=arguments.latency_scale,
+        fps=arguments.fps,
+        policy=arguments.policy,
+        convention=arguments.convention,
+        costs=arguments.cost,
+        sequences=arguments.sequence,
+        root=arguments.root,
+        dataset=arguments.dataset,
+        camera_lag=arguments.camera_lag,
+        folds=arguments.folds,
+        seed=arguments.seed,
+    )
     if arguments.out:
-        _write(table, arguments.out)
-    attributes = None
+        _write(result.scores, arguments.out)
+    tables = {"summary": result.summary}
     if arguments.attributes:
-        attributes = {
-            (trace.metadata.dataset, name): trace.metadata.attributes(name)
-            for trace in traces.values()
-            for name in table.loc[table["dataset"] == trace.metadata.dataset, "sequence"].unique()
+        tables["attributes"] = result.attributes
+    if arguments.plot:
+        from lae_sim.report.style import save
+
+        save(result.plot(), arguments.plot)
+    if arguments.sigma_grid:
+        tables = {name: table.assign(sigma="0, 0.02, ..., 1") for name, table in tables.items()}
+    if arguments.json:
+        document = {
+            "format": "lae-compare",
+            "version": "1.0",
+            "lae_sim": __version__,
+            "traces": paths,
+            "convention": arguments.convention,
+            "policy": arguments.policy,
+            "seed": arguments.seed,
+            "method": result.summary.attrs["method"],
+            "notes": result.notes,
+            **{name: _records(table) for name, table in tables.items()},
         }
-    _tell(arguments, table, attributes)
+        print(json.dumps(document, indent=2, allow_nan=False))
+        return
+    for table in reversed(tables.values()):
+        print(comparison_table(table), end="\n\n")
+    about = f"convention {arguments.convention}, policy {arguments.policy}"
+    print("\n".join([about, *result.notes]))
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def _check_files(arguments: argparse.Namespace, traces: Sequence[str]) -> None:
     """Refuse what would only fail after the work."""
     outputs = [path for path in (arguments.out, arguments.plot) if path]
-    check_distinct(outputs, arguments.traces)
+    check_distinct(outputs, traces)
     check_folders(outputs)
     if arguments.out and Path(arguments.out).suffix not in (".csv", ".parquet"):
         raise LaeError(f"--out {arguments.out}: name a .csv or .parquet file")
@@ -125,55 +157,6 @@ def _check(arguments: argparse.Namespace) -> None:
         from lae_sim.report.style import check_format
 
         check_format(arguments.plot)
-    from lae_sim.engine.scheduler import scores_latency
-    from lae_sim.replay.world import parse_policy
-
-    if not scores_latency(parse_policy(arguments.policy)):
-        raise LaeError("vot-realtime never scores latency: there is nothing to forecast")
-    if "offline" in arguments.forecaster:
-        raise LaeError("offline is always in the table: the tracker's own boxes, without latency")
-
-
-def _forecasters(
-    arguments: argparse.Namespace, traces: Mapping[str, Trace]
-) -> dict[str, AnyFactory | Trainer]:
-    fps = arguments.fps or next(iter(traces.values())).metadata.fps
-    camera = find_camera(
-        arguments.root, arguments.dataset, arguments.sequence, fps, arguments.camera_lag
-    )
-    worlds = {(trace.metadata.dataset, trace.metadata.fps) for trace in traces.values()}
-    if camera and len(worlds) > 1:
-        raise LaeError("--root is the folder of one dataset: compare its traces by themselves")
-    names = dict.fromkeys(["hold", *arguments.forecaster])
-    return {name: load_any(name, camera) for name in names}
-
-
-def _table(
-    arguments: argparse.Namespace,
-    traces: Mapping[str, Trace],
-    forecasters: Mapping[str, AnyFactory | Trainer],
-) -> DataFrame:
-    """Compare, with a progress bar if the standard error stream is a terminal."""
-    from tqdm import tqdm
-
-    from lae_sim.comparison.forecasters import score_forecasters, steps
-
-    worlds = worlds_of(
-        arguments,
-        sigma="grid" if arguments.sigma_grid else arguments.sigma,
-        convention=arguments.convention,
-        costs=arguments.cost,
-    )
-    total = steps(traces, forecasters, worlds, arguments.folds)
-    with tqdm(total=total, unit=" steps", disable=None) as bar:
-
-        def progress(what: str) -> None:
-            bar.set_description(what, refresh=False)
-            bar.update()
-
-        return score_forecasters(
-            traces, forecasters, worlds, arguments.folds, arguments.seed, progress
-        )
 
 
 def _write(table: DataFrame, path: str) -> None:
@@ -187,56 +170,7 @@ def _write(table: DataFrame, path: str) -> None:
             table.to_parquet(temporary, index=False)
 
 
-def _tell(
-    arguments: argparse.Namespace,
-    table: DataFrame,
-    attributes: Mapping[tuple[str, str], Sequence[str]] | None,
-) -> None:
-    import json
-
-    from lae_sim import __version__
-    from lae_sim.comparison.statistics import by_attribute, over_sigmas, summarise
-    from lae_sim.report.comparison import comparison_table
-
-    metrics, notes = ("auc", "dp20"), table.attrs["notes"]
-    if arguments.sigma_grid:
-        table, metrics = over_sigmas(table), ("mauc", "mdp20")
-    settings: dict[str, Any] = {"metrics": metrics, "seed": arguments.seed}
-    summary = summarise(table, **settings)
-    divided = None if attributes is None else by_attribute(table, attributes, **settings)
-    if arguments.plot:
-        from lae_sim.report.forecaster_figures import overview
-        from lae_sim.report.style import save
-
-        save(overview(summary, metrics[0]), arguments.plot)
-    if arguments.sigma_grid:
-        for each in (summary, divided):
-            if each is not None:
-                each["sigma"] = "0, 0.02, ..., 1"
-    if arguments.json:
-        document: dict[str, Any] = {
-            "format": "lae-compare",
-            "version": "1.0",
-            "lae_sim": __version__,
-            "traces": arguments.traces,
-            "convention": arguments.convention,
-            "policy": arguments.policy,
-            "seed": arguments.seed,
-            "method": summary.attrs["method"],
-            "notes": notes,
-            "summary": _records(summary),
-        }
-        if divided is not None:
-            document["attributes"] = _records(divided)
-        print(json.dumps(document, indent=2, allow_nan=False))
-        return
-    if divided is not None:
-        print(comparison_table(divided), end="\n\n")
-    print(comparison_table(summary), end="\n\n")
-    print("\n".join([f"convention {arguments.convention}, policy {arguments.policy}", *notes]))
-
-
-def _records(summary: DataFrame) -> list[dict[str, Any]]:
+def _records(table: DataFrame) -> list[dict[str, Any]]:
     """The rows as JSON objects, NaN as null."""
-    rows: list[dict[str, Any]] = summary.to_dict("records")
+    rows: list[dict[str, Any]] = table.to_dict("records")
     return [{k: None if v != v else v for k, v in row.items()} for row in rows]

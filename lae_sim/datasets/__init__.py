@@ -1,5 +1,5 @@
 """Datasets as their publishers lay them out: frames, ground truth, attributes; and made-up ones."""
 
-import lazy_loader
+from lae_sim._faces import lazy_face
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__ = lazy_face(__name__, __file__)

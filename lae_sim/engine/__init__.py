@@ -3,6 +3,6 @@
 It knows no trace, no tracker and no metric: a service says how long a frame takes.
 """
 
-import lazy_loader
+from lae_sim._faces import lazy_face
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__ = lazy_face(__name__, __file__)

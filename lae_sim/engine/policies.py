@@ -39,12 +39,6 @@ class LanePolicy(Protocol):
         """
 
 
-def _start(clock: Clock, now: int, frame: int) -> tuple[int, int]:
-    """Start ``frame`` now, or at its arrival if that is still to come."""
-    arrival = frame * clock.frame_ticks
-    return frame, now if now > arrival else arrival
-
-
 def _later(a: Frames, b: Frames) -> Frames:
     """The greater of two frames, or of each two."""
     if type(a) is int:  # np.maximum on two numbers takes as long as the rest of the engine
@@ -66,7 +60,9 @@ class _ByLastCall(ABC):
 
     def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         last, _, now = calls[-1]
-        return _start(clock, now, self.next_lanes(clock, last, now))
+        frame = self.next_lanes(clock, last, now)
+        arrival = frame * clock.frame_ticks
+        return frame, now if now > arrival else arrival
 
 
 @dataclass(frozen=True)
@@ -133,8 +129,8 @@ def listed(frames: Sequence[int]) -> Policy:
 
     def next_listed(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         _, _, now = calls[-1]
-        beyond = len(calls) >= len(frames)
-        return _start(clock, now, frames[-1] + _BEYOND if beyond else frames[len(calls)])
+        frame = frames[len(calls)] if len(calls) < len(frames) else frames[-1] + _BEYOND
+        return frame, max(now, frame * clock.frame_ticks)
 
     return next_listed
 

@@ -1,5 +1,5 @@
 """Forecasters: from the outputs so far, where the target is at the time of a query."""
 
-import lazy_loader
+from lae_sim._faces import lazy_face
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__ = lazy_face(__name__, __file__)

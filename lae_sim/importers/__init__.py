@@ -1,5 +1,5 @@
 """Results that other toolkits have written, as recordings of a trace."""
 
-import lazy_loader
+from lae_sim._faces import lazy_face
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import is_dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard, cast
 
 from lae_sim.errors import LaeError, hint, shown
 from lae_sim.plugins import bound, imported, key_and_value, parse_options
@@ -64,15 +64,18 @@ def load_forecaster(name: str, camera: Camera | None = None) -> AnyFactory:
         >>> lae_sim.load_forecaster("kalman:q=3,decay=0.99")
         TunedKalman(q=3, r=10.0, p0=100.0, decay=0.99, state='corner')
     """
-    from lae_sim.learning.folds import Trainer
-
     found = load_any(name, camera)
-    if isinstance(found, Trainer):
+    if needs_training(found):
         raise LaeError(
             f"{name} must be trained: lae-sim compare does so on other sequences; lae-sim train "
             "makes a file for learned:FILE.pt; kalman:q=3,decay=0.99 takes numbers as they are"
         )
-    return found
+    return cast("AnyFactory", found)
+
+
+def needs_training(forecaster: AnyFactory | Trainer) -> TypeGuard[Trainer]:
+    """Whether it is a :class:`lae_sim.learning.folds.Trainer`, without importing that module."""
+    return hasattr(forecaster, "fit")
 
 
 def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:

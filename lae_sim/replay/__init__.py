@@ -1,5 +1,5 @@
 """Replaying recordings: under which world, with which processing times and boxes."""
 
-import lazy_loader
+from lae_sim._faces import lazy_face
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -1,5 +1,5 @@
 """What people look at: tables as text, CSV, LaTeX and HTML; figures, pages, films, timelines."""
 
-import lazy_loader
+from lae_sim._faces import lazy_face
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__ = lazy_face(__name__, __file__)

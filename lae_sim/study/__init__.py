@@ -1,5 +1,5 @@
 """Studies: many traces in many worlds, computed once per cell, on all cores or a cluster."""
 
-import lazy_loader
+from lae_sim._faces import lazy_face
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__ = lazy_face(__name__, __file__)

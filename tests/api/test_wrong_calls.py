@@ -119,7 +119,7 @@ FOR_COMPARISONS: list[tuple[dict[str, Any], str]] = [
     ({"policy": "vot-realtime"}, "policy: vot-realtime never scores latency"),
     ({"policy": ["latest", "fifo"]}, "fps and policy: one of each"),
     ({"fps": [30, 60]}, "fps and policy: one of each"),
-    ({"folds": 1}, "folds: 1 is not a whole number from 2"),
+    ({"folds": 1}, "folds: training .* needs at least two folds"),
     ({"folds": 2.5}, "folds: 2.5 is not a whole number"),
     ({"seed": -1}, "seed: -1 is not a whole number from 0"),
     ({"seed": "x"}, "seed: 'x' is not a whole number"),
