@@ -26,7 +26,7 @@ _GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at o
 _LANE_FRAMES = 1 << 21  # and of their repetitions
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Run:
     """One sequence replayed.
 
@@ -59,6 +59,10 @@ class Run:
     def __len__(self) -> int:
         """Number of world frames T."""
         return self.schedule.length
+
+    def __repr__(self) -> str:
+        processed = f"{len(self.schedule.frames):,} of {len(self):,} frames processed"
+        return f"<Run of {self.recording.name!r} at {self.schedule.clock.fps} fps: {processed}>"
 
 
 def replay_sequence(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +13,11 @@ from lae_sim._arrays import Floats, Ints
 from lae_sim.engine.scheduler import Schedule
 from lae_sim.errors import LaeError
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
     """One sequence of a trace, by world frame.
 
@@ -43,6 +46,19 @@ class Recording:
     def __len__(self) -> int:
         """Number of world frames T."""
         return len(self.elapsed_ns)
+
+    def __repr__(self) -> str:
+        processed = int((self.elapsed_ns >= 0).sum())
+        return f"<Recording of {self.name!r}: {len(self):,} frames, {processed:,} processed>"
+
+    def to_frame(self) -> DataFrame:
+        """A row per world frame, with the columns of the trace format; NaN is unknown."""
+        import pandas as pd
+
+        columns = {"sequence": self.name, "frame": np.arange(len(self))}
+        columns |= dict(zip(("truth_x", "truth_y", "truth_w", "truth_h"), self.truth.T))
+        columns |= dict(zip(("x", "y", "w", "h"), self.boxes.T))
+        return pd.DataFrame({**columns, "elapsed_ns": self.elapsed_ns, "score": self.score})
 
     @classmethod
     def new(
