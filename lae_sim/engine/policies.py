@@ -67,6 +67,8 @@ class _ByLastCall(ABC):
 
 @dataclass(frozen=True)
 class _Latest(_ByLastCall):
+    label: ClassVar[str] = "latest"
+
     def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
         return _later(now // clock.frame_ticks, last + 1)
 
@@ -75,6 +77,10 @@ class _Latest(_ByLastCall):
 class _Every(_ByLastCall):
     n: int
 
+    @property
+    def label(self) -> str:
+        return "fifo" if self.n == 1 else f"every:{self.n}"
+
     def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
         return last + min(self.n, _BEYOND)
 
@@ -82,6 +88,10 @@ class _Every(_ByLastCall):
 @dataclass(frozen=True)
 class _ShrinkingTail(_ByLastCall):
     expected_ns: int
+
+    @property
+    def label(self) -> str:
+        return f"shrinking-tail:{self.expected_ns}ns"
 
     def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
         interval = clock.frame_ticks
@@ -139,6 +149,10 @@ def listed(frames: Sequence[int]) -> Policy:
 class _VotRealtime:
     grace: int
     scores_latency: ClassVar[bool] = False
+
+    @property
+    def label(self) -> str:
+        return f"vot-realtime:{self.grace}"
 
     def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         interval = clock.frame_ticks

@@ -57,12 +57,22 @@ def constant(elapsed: str | None = None, *, ns: int | None = None) -> LatencySou
     Raises:
         LaeError: if it is not a duration, or below zero.
     """
-    time = np.array(min(duration_ns(elapsed, ns), MAX_INT64), np.int64)
+    return _Constant(duration_ns(elapsed, ns))
 
-    def source(recording: Recording) -> Times:
+
+@dataclass(frozen=True)
+class _Constant:
+    ns: int
+
+    @property
+    def label(self) -> str:
+        """The name of the source in tables."""
+        ms = Fraction(self.ns, 10**6)
+        return f"constant:{ms}ms" if ms.denominator == 1 else f"constant:{self.ns}ns"
+
+    def __call__(self, recording: Recording) -> Times:
+        time = np.array(min(self.ns, MAX_INT64), np.int64)
         return Times(recording.name, np.broadcast_to(time, len(recording)), by_call=True)
-
-    return source
 
 
 @dataclass(frozen=True)

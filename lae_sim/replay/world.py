@@ -6,8 +6,8 @@ Command lines, study files and keyword arguments all make worlds, through the pa
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import product
 from typing import Any, TypeAlias, TypeVar
@@ -42,9 +42,24 @@ Value = TypeVar("Value")
 _POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime")
 _LATENCIES = ("recorded", "by-call", "constant", "resample", "lognormal", "bootstrap")
 
-_PLUGIN: tuple[Any, ...] = (str, Callable)
 _TRACE = (str, os.PathLike, Trace)
 _A_TRACE = "a path, a URL or what read_trace gives"
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A user's own policy or source of times, made once, under the name that asks for it.
+
+    Attributes:
+        label: ``package.module:object``.
+        made: what that is, or an instance of it if it is a class.
+    """
+
+    label: str
+    made: Any = field(compare=False)
+
+
+_PLUGIN: tuple[Any, ...] = (str, Plugin, Callable)
 
 
 @dataclass(frozen=True)
@@ -78,8 +93,8 @@ class World:
     """
 
     fps: Fraction | None = None
-    policy: str | Policy = "latest"
-    latency: str | LatencySource = "recorded"
+    policy: str | Policy | Plugin = "latest"
+    latency: str | LatencySource | Plugin = "recorded"
     scale: Fraction = Fraction(1)
     timing: TraceLike | None = None
     passes: tuple[TraceLike, ...] = ()
@@ -92,7 +107,12 @@ class World:
         for name in ("passes", "sigmas", "forecasters", "costs"):
             if not isinstance(getattr(self, name), tuple):
                 raise LaeError(f"{name} of a World is a tuple; World.of takes one value too")
-        _check_kinds("policy", [self.policy], _PLUGIN, "a name, such as 'latest', or a function")
+        _check_kinds(
+            "policy",
+            [self.policy],
+            (str, Plugin, Callable),
+            "a name, such as 'latest', or a function",
+        )
         latency = "a name, such as 'recorded' or 'constant:47ms', or a function"
         _check_kinds("latency", [self.latency], _PLUGIN, latency)
         traces = [*self.passes] if self.timing is None else [self.timing, *self.passes]
@@ -112,16 +132,17 @@ class World:
         if not scores_latency(self.rule()):
             for given, what in ((any(self.sigmas), "permitted latency"), (self.costs, "cost")):
                 if given:
-                    name = self.policy if isinstance(self.policy, str) else "the policy"
-                    raise LaeError(f"{name} never scores latency: it goes with no {what}")
+                    raise LaeError(
+                        f"{label_of(self.policy)} never scores latency: it goes with no {what}"
+                    )
 
     @classmethod
     def of(
         cls,
         *,
         fps: Number | None = None,
-        policy: str | Policy = "latest",
-        latency: str | LatencySource = "recorded",
+        policy: str | Policy | Plugin = "latest",
+        latency: str | LatencySource | Plugin = "recorded",
         scale: Number = 1,
         timing: TraceLike | None = None,
         passes: TraceLike | Iterable[TraceLike] = (),
@@ -140,8 +161,8 @@ class World:
         """
         return cls(
             fps=None if fps is None else named("fps", parse_fps, fps),
-            policy=_checked("policy", policy, parse_policy),
-            latency=_checked("latency", latency, parse_latency),
+            policy=_made("policy", policy, parse_policy, _POLICIES),
+            latency=_made("latency", latency, parse_latency, _LATENCIES),
             scale=named("scale", _factor, scale),
             timing=timing,
             passes=several(passes),
@@ -163,33 +184,41 @@ class World:
     ) -> tuple[World, ...]:
         """The worlds of every combination of some policies, rates, latencies and scales.
 
-        Each is one value or several; the last varies fastest. ``others`` are as in :meth:`of`.
+        Each is one value or several; the last varies fastest. ``others`` are as in :meth:`of`. A
+        plug-in that is named is made once, and shared by the worlds.
 
         Raises:
-            LaeError: as :meth:`of`, or if there is nothing of one.
+            LaeError: as :meth:`of`, or if there is nothing of one, or two have the same name.
         """
-        swept = {
-            "policy": several(policy),
-            "fps": (None,) if fps is None else several(fps),
-            "latency": several(latency),
-            "scale": several(scale),
+        rules = [_made("policy", each, parse_policy, _POLICIES) for each in several(policy)]
+        times = [_made("latency", each, parse_latency, _LATENCIES) for each in several(latency)]
+        rates = [named("fps", parse_fps, each) for each in several(fps)]
+        factors = [named("scale", _factor, each) for each in several(scale)]
+        swept: dict[str, list[Any]] = {
+            "policy": _distinct("policy", rules),
+            "fps": [None] if fps is None else list(dict.fromkeys(rates)),
+            "latency": _distinct("latency", times),
+            "scale": list(dict.fromkeys(factors)),
         }
         for name, values in swept.items():
             if not values:
                 raise LaeError(f"{name}: name at least one")
-        worlds: list[World] = []
-        for values in product(*swept.values()):
-            world = cls.of(**dict(zip(swept, values)), **others)
-            if world not in worlds:  # a user's policy may have no hash
-                worlds.append(world)
-        return tuple(worlds)
+        for name, value in others.items():
+            if isinstance(value, Iterator):  # which gives its values once
+                others[name] = tuple(value)
+        combinations = product(*swept.values())
+        return tuple(cls.of(**dict(zip(swept, values)), **others) for values in combinations)
 
     def rule(self) -> Policy:
         """The policy itself."""
+        if isinstance(self.policy, Plugin):
+            return self.policy.made  # type: ignore[no-any-return]
         return parse_policy(self.policy) if isinstance(self.policy, str) else self.policy
 
     def source(self) -> LatencySource:
         """The source of the processing times, before they are scaled."""
+        if isinstance(self.latency, Plugin):
+            return self.latency.made  # type: ignore[no-any-return]
         return parse_latency(self.latency) if isinstance(self.latency, str) else self.latency
 
     def label(self) -> str:
@@ -421,11 +450,23 @@ def named(name: str, parse: Callable[[Any], Value], value: Any) -> Value:
         raise type(error)(f"{name}: {error}") from error
 
 
-def _checked(name: str, plugin: Value, parse: Callable[[str], object]) -> Value:
-    """A policy or a source of times, of which a name has been looked up."""
-    if isinstance(plugin, str):
-        named(name, parse, plugin)
-    return plugin
+def _made(name: str, given: Any, parse: Callable[[str], object], known: Iterable[str]) -> Any:
+    """A policy or a source of times: a name of ours that has been looked up, or what it is."""
+    if not isinstance(given, str):
+        return given
+    made = named(name, parse, given)
+    return given if given.partition(":")[0] in known else Plugin(given, made)
+
+
+def _distinct(name: str, plugins: Iterable[Any]) -> list[Any]:
+    """Policies or sources, each once; no two under the same name."""
+    found: dict[str, Any] = {}
+    for each in plugins:
+        label = label_of(each)
+        if label in found and not (each is found[label] or isinstance(each, (str, Plugin))):
+            raise LaeError(f"{name}: two are called {label!r}: give functions names")
+        found.setdefault(label, each)
+    return list(found.values())
 
 
 def _factor(value: Number) -> Fraction:
@@ -439,7 +480,9 @@ def label_of(plugin: object) -> str:
     """The name of a policy or a source of times in tables."""
     if isinstance(plugin, str):
         return plugin
-    return str(getattr(plugin, "__name__", type(plugin).__name__))
+    own = {id(sources.by_frame): "recorded", id(sources.by_call): "by-call"}.get(id(plugin))
+    label = own or getattr(plugin, "label", None) or getattr(plugin, "__name__", None)
+    return str(label or type(plugin).__name__)
 
 
 def _plugin(what: str, text: str, known: Iterable[str]) -> Any:

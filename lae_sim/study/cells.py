@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -63,7 +63,8 @@ class Setting:
     Attributes:
         trace: the boxes and the truth.
         timing: another device's trace that the times come from; the world names it too.
-        world: how the trace is replayed and scored; of random times with their seed.
+        world: how the trace is replayed, of random times with their seed; conventions, forecasters
+            and costs are the cells'.
         code: of a user's own policy or latency, a digest of its file.
         first, count: which repetitions of a random latency; 0 and 1 of any other.
         sequences: those wanted; all if empty.
@@ -123,7 +124,6 @@ class Setting:
             "first": self.first,
             "count": self.count,
             "sigmas": [str(sigma) for sigma in self.world.sigmas],
-            "convention": self.world.convention,
             "sequences": list(self.sequences),
         }
 
@@ -137,12 +137,14 @@ class Cell:
         forecaster: its name.
         code: what else it depends on: a digest of its file or of its training.
         cost_ns: what an answer costs.
+        convention: how frames and thresholds count.
     """
 
     setting: Setting
     forecaster: str
     code: str
     cost_ns: int
+    convention: str
 
     @cached_property
     def key(self) -> str:
@@ -154,6 +156,7 @@ class Cell:
             "forecaster": self.forecaster,
             "code": self.code,
             "cost_ns": self.cost_ns,
+            "convention": self.convention,
         }
         return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:32]
 
@@ -163,7 +166,7 @@ class Cell:
             **self.setting.columns(),
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
-            "convention": self.setting.world.convention,
+            "convention": self.convention,
             "forecaster": self.forecaster,
         }
 
@@ -197,14 +200,25 @@ class Result:
 
 
 def compute(task: Task) -> list[Result]:
-    """Replay, and score with every forecaster.
+    """Replay once for each convention, and score.
 
     Raises:
         LaeError: whatever replaying and scoring raise.
     """
-    cells, factories = task.cells, task.factories
+    conventions = dict.fromkeys(cell.convention for cell in task.cells)
+    return [
+        result
+        for convention in conventions
+        for result in _computed(
+            [cell for cell in task.cells if cell.convention == convention], task.factories
+        )
+    ]
+
+
+def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> list[Result]:
+    """The results of cells of one setting and one convention."""
     setting = cells[0].setting
-    world, convention = setting.world, find_convention(setting.world.convention)
+    world, convention = setting.world, find_convention(cells[0].convention)
     trace = held(read_trace(setting.trace.path, setting.sequences or None))
     chosen = {cell.forecaster: factories[cell.forecaster] for cell in cells}
     costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}

@@ -118,7 +118,7 @@ def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
         trace.metadata,
         {cell.forecaster: search.factory},
         setting.world.sigmas,
-        find_convention(cell.setting.world.convention),
+        find_convention(cell.convention),
         costs={cell.forecaster: cell.cost_ns},
     )
     scores = np.concatenate([part.scores["auc"][0, :, 0] for part in parts])
@@ -143,7 +143,7 @@ def requirement(search: Search, answer: Slowest) -> Requirement:
         policy=setting.policy,
         fps=setting.fps,
         latency=setting.latency,
-        convention=setting.world.convention,
+        convention=search.cell.convention,
         forecaster=search.cell.forecaster,
         sigma=setting.world.sigmas[0],
         required_auc=float(search.required),

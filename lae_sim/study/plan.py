@@ -114,9 +114,10 @@ def make_plan(study: Study, base: Path | None = None) -> Plan:
     codes = {name: _code(name, each, training) for name, each in forecasters.items()}
     costs = resolve_costs(study.costs, dict.fromkeys(names, Hold), ())  # none is measured
     cells = [
-        Cell(setting, name, codes[name], costs.get(name, 0))
+        Cell(setting, name, codes[name], costs.get(name, 0), convention)
         for source in traces
         for setting in _settings(study, source, timing)
+        for convention in study.conventions
         for name in forecasters
     ]
     return Plan(study, tuple(sources.values()), tuple(cells), forecasters, training)
@@ -140,8 +141,8 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
     rates = dict.fromkeys(source.metadata.fps if fps is None else fps for fps in study.fps)
     found = []
     chunk = max(1, CHUNK_FRAMES // (max(source.frames, 1) * max(1, len(study.sigmas) // 8)))
-    for times, policy, fps, latency, scale, convention in product(
-        [None, *theirs], study.policies, rates, study.latencies, study.scales, study.conventions
+    for times, policy, fps, latency, scale in product(
+        [None, *theirs], study.policies, rates, study.latencies, study.scales
     ):
         world = World(
             fps=fps,
@@ -150,7 +151,6 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
             scale=scale,
             timing=None if times is None else times.path,
             sigmas=study.sigmas,
-            convention=convention,
         )
         setting = Setting(
             trace=source.input,

@@ -35,7 +35,7 @@ class Scores:
     Attributes:
         source: the trace.
         setting: the first of the settings, which differ in their repetitions.
-        forecaster: its name.
+        forecaster, convention: names.
         sequences: names, S of them.
         means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``;
             of ``mismatch_max`` and ``longest_hold`` the largest (frames).
@@ -49,17 +49,13 @@ class Scores:
     source: Source
     setting: Setting
     forecaster: str
+    convention: str
     sequences: tuple[str, ...]
     means: Mapping[str, Floats]
     repeated: Mapping[str, Floats]
     over_sigmas: Mapping[str, Floats]
     once: Mapping[str, Floats]
     about: tuple[Mapping[str, Any], ...]
-
-    @property
-    def convention(self) -> str:
-        """How frames and thresholds count."""
-        return self.setting.world.convention
 
     @property
     def group(self) -> tuple[str, ...]:
@@ -93,10 +89,10 @@ _ONCE = ("world_frames", "processed", "elapsed_ms", *(f"offline_{m}" for m in ME
 def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
     """The finished cells of a study, in the order of the plan; one after another."""
     sources = {source.input: source for source in plan.sources}
-    together: dict[tuple[Setting, str], list[Cell]] = {}
+    together: dict[tuple[Setting, str, str], list[Cell]] = {}
     for cell in plan.cells:
         same = replace(cell.setting, first=0, count=1)
-        together.setdefault((same, cell.forecaster), []).append(cell)
+        together.setdefault((same, cell.forecaster, cell.convention), []).append(cell)
     for cells in together.values():
         if all(store.has(cell) for cell in cells):
             yield _read(cells, sources[cells[0].setting.trace], store)
@@ -145,6 +141,7 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
         source=source,
         setting=first.setting,
         forecaster=first.forecaster,
+        convention=first.convention,
         sequences=names,
         means={name: totals[name] for name in numbers},
         repeated={name: np.concatenate(parts) for name, parts in repeated.items()},

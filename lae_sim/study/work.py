@@ -111,4 +111,4 @@ def _in_words(setting: Setting, scale: bool = True) -> str:
 
 def cell_in_words(cell: Cell) -> str:
     """What a cell is about, in words."""
-    return f"{_in_words(cell.setting)}, {cell.forecaster}, {cell.setting.world.convention}"
+    return f"{_in_words(cell.setting)}, {cell.forecaster}, {cell.convention}"
