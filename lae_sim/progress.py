@@ -32,7 +32,7 @@ class ProgressBar:
             return
         if self._bar is None:
             options = {"desc": self._title, "unit": f" {self._unit}"}
-            self._bar = _tqdm()(**options, unit_scale=self._unit == "frames")
+            self._bar = _tqdm()(**options, total=total, unit_scale=self._unit == "frames")
         if what:
             self._bar.set_description(what, refresh=False)
         self._bar.total = total

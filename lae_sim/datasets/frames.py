@@ -24,7 +24,7 @@ Image = npt.NDArray[np.uint8]
 """A frame as OpenCV has it: uint8 [H, W, 3], blue, green, red."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ImageSequence:
     """One sequence of a dataset.
 
@@ -45,8 +45,11 @@ class ImageSequence:
         """Number of frames T."""
         return len(self.truth)
 
+    def __repr__(self) -> str:
+        return f"<ImageSequence {self.name!r}: {len(self)} frames>"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Dataset:
     """Sequences that belong together.
 
@@ -59,6 +62,9 @@ class Dataset:
     name: str
     fps: Fraction
     sequences: Sequence[ImageSequence]
+
+    def __repr__(self) -> str:
+        return f"<Dataset {self.name!r}: {len(self.sequences)} sequences at {self.fps} fps>"
 
 
 def read_image(path: Path) -> Image:

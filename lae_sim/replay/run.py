@@ -26,7 +26,7 @@ _GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at o
 _LANE_FRAMES = 1 << 21  # and of their repetitions
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Run:
     """One sequence replayed.
 
@@ -46,6 +46,8 @@ class Run:
         >>> import lae_sim
         >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
         >>> run = next(iter(runs))
+        >>> run
+        <Run of 'bike-pan': 300 frames, ... processed, ... departures>
         >>> run.recording.name, len(run), len(run.schedule.frames), run.departures
         ('bike-pan', 300, 213, 86)
     """
@@ -59,6 +61,11 @@ class Run:
     def __len__(self) -> int:
         """Number of world frames T."""
         return self.schedule.length
+
+    def __repr__(self) -> str:
+        processed = len(self.schedule.frames)
+        about = f"{len(self)} frames, {processed} processed, {self.departures} departures"
+        return f"<Run of {self.recording.name!r}: {about}>"
 
 
 def replay_sequence(

@@ -14,7 +14,7 @@ from lae_sim.engine.scheduler import Schedule
 from lae_sim.errors import LaeError
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
     """One sequence of a trace, by world frame.
 
@@ -43,6 +43,11 @@ class Recording:
     def __len__(self) -> int:
         """Number of world frames T."""
         return len(self.elapsed_ns)
+
+    def __repr__(self) -> str:
+        times = self.elapsed_ns[self.elapsed_ns >= 0]
+        median = f", median {np.median(times) / 1e6:.3g} ms" if len(times) else ""
+        return f"<Recording {self.name!r}: {len(self)} frames, {len(times)} processed{median}>"
 
     @classmethod
     def new(
