@@ -60,5 +60,6 @@ def shown(value: object) -> str:
 
 def hint(name: object, known: Iterable[str]) -> str:
     """What was perhaps meant by a name that is not known, to end a message with."""
-    close = difflib.get_close_matches(name, list(known), 1) if isinstance(name, str) else []
+    others = [each for each in known if each != name]
+    close = difflib.get_close_matches(name, others, 1) if isinstance(name, str) else []
     return f"; did you mean {close[0]!r}?" if close else ""

@@ -6,6 +6,9 @@ import sys
 import warnings
 from typing import Any
 
+SOON_S = 0.5
+"""What is done sooner shows no bar, unless it is asked for."""
+
 
 class ProgressBar:
     """A bar on the standard error stream; ``bar(done, total)`` moves it.
@@ -24,6 +27,7 @@ class ProgressBar:
     def __init__(self, title: str, unit: str, show: bool | None = None) -> None:
         self._title, self._unit = str(title), unit
         self.shown = _somebody_looks() if show is None else show
+        self._delay = 0.0 if show else SOON_S
         self._bar: Any = None
 
     def __call__(self, done: int, total: int | None, what: str = "") -> None:
@@ -31,8 +35,13 @@ class ProgressBar:
         if not self.shown:
             return
         if self._bar is None:
-            options = {"desc": self._title, "unit": f" {self._unit}"}
-            self._bar = _tqdm()(**options, total=total, unit_scale=self._unit == "frames")
+            self._bar = _tqdm()(
+                desc=self._title,
+                total=total,
+                unit=f" {self._unit}",
+                unit_scale=self._unit == "frames",
+                delay=self._delay,
+            )
         if what:
             self._bar.set_description(what, refresh=False)
         self._bar.total = total

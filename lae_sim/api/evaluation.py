@@ -209,7 +209,10 @@ def scenarios(
     return found
 
 
-SETTING = ("trace", "tracker", "dataset", "policy", "fps", "latency", "scale", "convention")
+SETTING = (
+    *("trace", "tracker", "dataset", "times_from"),
+    *("policy", "fps", "latency", "scale", "convention"),
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -402,11 +405,12 @@ class EvaluationResult:
 
 def _setting(scenario: Scenario) -> dict[str, Any]:
     """What the rows of a scenario are of, by the names of :data:`SETTING`."""
-    metadata, world = scenario.trace.metadata, scenario.world
+    metadata, world, timing = scenario.trace.metadata, scenario.world, scenario.runs.timing
     values = (
         scenario.label,
         metadata.tracker,
         metadata.dataset,
+        scenario.label if timing is None else Path(path_of(timing) or timing.metadata.device).name,
         label_of(world.policy),
         float(scenario.runs.clock.fps),
         label_of(world.latency),

@@ -42,6 +42,8 @@ def run_study(
         progress: whether to show a progress bar; by default on a terminal and in a notebook.
         keys: keys of the study file (see :class:`Study`).
 
+    In a script, call it under ``if __name__ == "__main__":``, since workers import the script.
+
     Raises:
         LaeError: if a key is unknown or a value impossible, a trace is missing, or nothing could be
             computed; it says which.

@@ -45,7 +45,9 @@ examples:
 {FORECASTERS}
 policies:     latest, fifo, every:N, shrinking-tail:TIME (expected processing time, such as 47ms),
               vot-realtime[:GRACE] (the VOT toolkit's rule: it skips frames, never scores latency)
-latencies:    recorded, by-call, constant:TIME, resample:SEED, lognormal:SEED
+              or your own, package.module:object
+latencies:    recorded, by-call, constant:TIME, resample:SEED, lognormal:SEED,
+              bootstrap:SEED[:BLOCK], or your own, package.module:object
 conventions:  pysot, elae, otb, got10k, got10k-101, exclude
 """
 

@@ -46,7 +46,7 @@ class ImageSequence:
         return len(self.truth)
 
     def __repr__(self) -> str:
-        return f"<ImageSequence {self.name!r}: {len(self)} frames>"
+        return f"<ImageSequence {self.name!r}: {len(self):,} frames>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -41,7 +41,7 @@ from the arrival of their own frames (see :class:`Schedule`).
 """
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Schedule:
     """What one sequence's processing looked like, in processing order.
 
@@ -61,6 +61,10 @@ class Schedule:
     start: Ints
     ready: Ints
     scores_latency: bool = True
+
+    def __repr__(self) -> str:
+        processed = f"{len(self.frames):,} of {self.length:,} frames processed"
+        return f"<Schedule at {self.clock.fps} fps: {processed}>"
 
     @property
     def elapsed_ns(self) -> Ints:

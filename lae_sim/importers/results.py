@@ -107,14 +107,14 @@ def given_times(text: str, tracker: str) -> GivenTimes | None:
     Raises:
         LaeError: if there is no such name, or the file lacks the tracker or a column.
     """
-    name, _, value = text.partition(":")
+    name, _, value = text.partition(":") if isinstance(text, str) else (None, "", "")
     if text == "measured":
         return None
     if name == "constant":
         amount = re.sub(r"(?<=\d)(?=[a-z])", " ", value)
         return GivenTimes(f"constant {amount}, not measured", parse_duration(value), {})
     if name != "mean-fps":
-        raise LaeError(f"no time {text[:40]!r}: use the measured ones, or {NO_TIMES}")
+        raise LaeError(f"time: no {text!r:.40}: use the measured ones, or {NO_TIMES}")
     if not value.lower().endswith(".csv"):
         source = f"mean fps {value} given, not measured per frame"
         return GivenTimes(source, frame_ns(parse_fps(value)), {})

@@ -47,7 +47,7 @@ class Run:
         >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
         >>> run = next(iter(runs))
         >>> run
-        <Run of 'bike-pan': 300 frames, ... processed, ... departures>
+        <Run of 'bike-pan' at 30 fps: ... of 300 frames processed>
         >>> run.recording.name, len(run), len(run.schedule.frames), run.departures
         ('bike-pan', 300, 213, 86)
     """
@@ -63,9 +63,8 @@ class Run:
         return self.schedule.length
 
     def __repr__(self) -> str:
-        processed = len(self.schedule.frames)
-        about = f"{len(self)} frames, {processed} processed, {self.departures} departures"
-        return f"<Run of {self.recording.name!r}: {about}>"
+        processed = f"{len(self.schedule.frames):,} of {len(self):,} frames processed"
+        return f"<Run of {self.recording.name!r} at {self.schedule.clock.fps} fps: {processed}>"
 
 
 def replay_sequence(

@@ -39,6 +39,9 @@ TraceLike: TypeAlias = "str | os.PathLike[str] | Trace"
 
 Value = TypeVar("Value")
 
+_POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime")
+_LATENCIES = ("recorded", "by-call", "constant", "resample", "lognormal", "bootstrap")
+
 _PLUGIN: tuple[Any, ...] = (str, Callable)
 _TRACE = (str, os.PathLike, Trace)
 _A_TRACE = "a path, a URL or what read_trace gives"
@@ -310,12 +313,11 @@ def parse_policy(text: str) -> Policy:
     if name == "vot-realtime":
         return policies.vot_realtime(*([_number(text, value)] if value else []))
     if colon and name not in ("latest", "fifo", "shrinking-tail"):
-        policy: Policy = _plugin("policy", text)
+        policy: Policy = _plugin("policy", text, _POLICIES)
         return policy
     raise LaeError(
         f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
-        "vot-realtime[:GRACE], package.module:object"
-        + hint(name, ("latest", "fifo", "every", "shrinking-tail", "vot-realtime"))
+        f"vot-realtime[:GRACE], package.module:object{hint(name, _POLICIES)}"
     )
 
 
@@ -342,12 +344,12 @@ def parse_latency(text: str) -> LatencySource:
         seed, *block = value.split(":", 1)
         return sources.bootstrap(_number(text, seed), *(_number(text, n, least=1) for n in block))
     if colon and name not in ("recorded", "by-call"):
-        source: LatencySource = _plugin("latency", text)
+        source: LatencySource = _plugin("latency", text, _LATENCIES)
         return source
+    meant = f"; did you mean constant:{text}?" if text[:1].isdigit() else hint(name, _LATENCIES)
     raise LaeError(
         f"no latency {text!r}: there are recorded, by-call, constant:47ms, resample:SEED, "
-        "lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object"
-        + hint(name, ("recorded", "by-call", "constant", "resample", "lognormal", "bootstrap"))
+        f"lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object{meant}"
     )
 
 
@@ -389,7 +391,8 @@ def text(value: Any) -> str:
         LaeError: if the value is none.
     """
     if not isinstance(value, str) or not value:
-        raise LaeError(f"{shown(value)} is not text")
+        own = ": name your own as 'package.module:object'" if callable(value) else ""
+        raise LaeError(f"{shown(value)} is not text{own}")
     return value
 
 
@@ -439,9 +442,12 @@ def label_of(plugin: object) -> str:
     return str(getattr(plugin, "__name__", type(plugin).__name__))
 
 
-def _plugin(what: str, text: str) -> Any:
+def _plugin(what: str, text: str, known: Iterable[str]) -> Any:
     """What a user made, or an instance of it if it is a class."""
-    made = imported(f"{what} {text!r}", text)
+    try:
+        made = imported(f"{what} {text!r}", text)
+    except LaeError as error:
+        raise LaeError(f"{error}{hint(text.partition(':')[0], known)}") from error
     return bound(f"{what} {text!r}", made, [], {}) if isinstance(made, type) else made
 
 

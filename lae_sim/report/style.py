@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial, wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from zlib import crc32
@@ -130,19 +130,23 @@ def styled(draw: Callable[P, T]) -> Callable[P, T]:
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure, of its own: pyplot would keep a list of all.
 
-    A notebook shows it without ``%matplotlib inline``, which tells pyplot only.
+    A notebook shows it as a picture, whether or not Matplotlib is set up there.
     """
+    return _figure_class()(figsize=(width, height), layout="constrained")
+
+
+@cache
+def _figure_class() -> type[Figure]:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    setattr(figure, "_repr_png_", partial(_png_of, figure))  # noqa: B010 - it has no such attribute
-    return figure
+    class ShownFigure(Figure):
+        def _repr_png_(self) -> bytes:
+            picture = io.BytesIO()
+            self.savefig(picture, format="png", dpi=100)
+            return picture.getvalue()
 
-
-def _png_of(figure: Figure) -> bytes:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=100)
-    return file.getvalue()
+    ShownFigure.__name__ = ShownFigure.__qualname__ = "Figure"
+    return ShownFigure
 
 
 def panel_grid(

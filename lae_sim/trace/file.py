@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from lae_sim.trace.columns import BOX, TRUTH, Rows, checksums
 from lae_sim.trace.locate import is_url, opened
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 HELD_FRAMES = 1 << 18
 
@@ -57,6 +60,12 @@ class Trace:
 
     def __bool__(self) -> bool:
         return True  # a trace that is there; its length may have to be read
+
+    def to_frame(self) -> DataFrame:
+        """A row per world frame of every sequence, with the columns of the trace format."""
+        import pandas as pd
+
+        return pd.concat([recording.to_frame() for recording in self], ignore_index=True)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

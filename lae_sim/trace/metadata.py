@@ -20,7 +20,7 @@ VERSION = "1.0"
 KINDS = ("every-frame", "real-time")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Metadata:
     """What a trace says of itself.
 
@@ -41,6 +41,10 @@ class Metadata:
     fps: Fraction
     kind: str
     document: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        of = f"{self.tracker!r} on {self.dataset!r}, taken on {self.device!r}"
+        return f"<Metadata of {of}: {self.kind} at {self.fps} fps>"
 
     @classmethod
     def new(cls, fps: Number, kind: str, **more: Any) -> Metadata:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,9 @@ import numpy.typing as npt
 from lae_sim._arrays import Floats, Ints
 from lae_sim.engine.scheduler import Schedule
 from lae_sim.errors import LaeError
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,9 +48,17 @@ class Recording:
         return len(self.elapsed_ns)
 
     def __repr__(self) -> str:
-        times = self.elapsed_ns[self.elapsed_ns >= 0]
-        median = f", median {np.median(times) / 1e6:.3g} ms" if len(times) else ""
-        return f"<Recording {self.name!r}: {len(self)} frames, {len(times)} processed{median}>"
+        processed = int((self.elapsed_ns >= 0).sum())
+        return f"<Recording of {self.name!r}: {len(self):,} frames, {processed:,} processed>"
+
+    def to_frame(self) -> DataFrame:
+        """A row per world frame, with the columns of the trace format; NaN is unknown."""
+        import pandas as pd
+
+        columns = {"sequence": self.name, "frame": np.arange(len(self))}
+        columns |= dict(zip(("truth_x", "truth_y", "truth_w", "truth_h"), self.truth.T))
+        columns |= dict(zip(("x", "y", "w", "h"), self.boxes.T))
+        return pd.DataFrame({**columns, "elapsed_ns": self.elapsed_ns, "score": self.score})
 
     @classmethod
     def new(
