@@ -125,7 +125,13 @@ class ComparisonResult:
 
     def _repr_html_(self) -> str:
         table = self.summary[self.summary["metric"] == self.metrics[0]]
-        html: str = table.to_html(index=False, float_format="{:.4f}".format, na_rep="-")
+        settings = ("trace", "latency", "scale", "sigma")
+        shown = [
+            *(name for name in settings if table[name].nunique() > 1 or name == "trace"),
+            *("forecaster", "sequences", "mean", "low", "high", "recovered"),
+            *("vs_hold", "vs_hold_low", "vs_hold_high", "vs_hold_p"),
+        ]
+        html: str = table[shown].to_html(index=False, float_format="{:.4f}".format, na_rep="-")
         return html + "".join(f"<p>{escape(note)}</p>" for note in self.notes)
 
 

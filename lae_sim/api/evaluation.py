@@ -467,17 +467,29 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
 
     first = parts[0].scenario
     at = first.world.sigmas[0] if sigma is None else sigma
-    traces = list(dict.fromkeys(part.scenario.label for part in parts))
-    title = "" if len(traces) > 1 else f"{first.label}: "
+    settings = [_setting(part.scenario) for part in parts]
+    several = [
+        name
+        for name in ("trace", "policy", "latency")
+        if len({setting[name] for setting in settings}) > 1
+    ]
+    title = "" if "trace" in several else f"{first.label}: "
     title += f"sigma {sigma_text(at)}, convention {first.world.convention}"
+    runs = [tuple(setting[name] for name in several) for setting in settings]
     reports = [part.document() for part in parts]
-    swept = [key for key in ("fps", "latency_scale") if len({each[key] for each in reports}) > 1]
+    swept = [
+        key
+        for key in ("fps", "latency_scale")
+        if len({(run, each[key]) for run, each in zip(runs, reports)}) > len(set(runs))
+    ]
     if swept:
-        names = [part.scenario.label for part in parts]
+        names = [", ".join(run) for run in runs]
         return figures.sweep_figure(reports, names, float(at), swept, title)
     curves = {}
-    for part in parts:
-        prefix = f"{Path(part.scenario.label).with_suffix('')}: " if len(traces) > 1 else ""
+    for part, run in zip(parts, runs):
+        if "trace" in several:
+            run = (str(Path(run[0]).with_suffix("")), *run[1:])
+        prefix = f"{', '.join(run)}: " if run else ""
         found = figures.mean_curves(part.totals.curves, list(part.scenario.forecasters))
         curves.update({prefix + name: curve for name, curve in found.items()})
     return figures.success_and_precision(curves, title)

@@ -129,7 +129,7 @@ def _maker(name: Any, forecaster: Any) -> Any:
     )
     if not (makes or isinstance(forecaster, str)):
         raise LaeError(f"forecasters: {shown(forecaster)} is neither a name nor makes forecasters")
-    if isinstance(forecaster, type):
+    if isinstance(forecaster, type) and not hasattr(forecaster, "for_sequence"):
         missing = [each for each in ("update", "predict") if not hasattr(forecaster, each)]
         if missing:
             raise LaeError(f"forecasters: the class {name} has no {' and no '.join(missing)}")

@@ -46,6 +46,8 @@ class Run:
         >>> import lae_sim
         >>> runs = lae_sim.replay_trace("traces/synthetic-slow.parquet", latency="constant:47ms")
         >>> run = next(iter(runs))
+        >>> run
+        <Run of 'bike-pan' at 30 fps: ... of 300 frames processed>
         >>> run.recording.name, len(run), len(run.schedule.frames), run.departures
         ('bike-pan', 300, 213, 86)
     """

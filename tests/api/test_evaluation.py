@@ -357,6 +357,29 @@ def test_a_plot_of_a_sweep_is_over_what_was_swept() -> None:
         np.testing.assert_allclose(np.sort(line.get_ydata()), np.sort(expected), atol=1e-12)
 
 
+def test_a_plot_of_several_latencies_or_policies_has_all_of_them() -> None:
+    latencies = ["constant:20ms", "constant:47ms"]
+    figure = lae_sim.evaluate(SLOW, latency=latencies, policy=["latest", "fifo"]).plot()
+    names = [line.get_label().partition(" [")[0] for line in figure.axes[0].lines]
+    worlds = [f"{policy}, {latency}" for policy in ("latest", "fifo") for latency in latencies]
+    assert names == [f"{w}: {name}" for w in worlds for name in ("offline", "hold", "kalman")]
+    swept = lae_sim.evaluate(SLOW, latency=latencies, scale=[1, 2], forecasters="hold").plot()
+    assert [axes.get_title() for axes in swept.axes[::2]] == latencies
+
+
+def test_traces_of_different_rates_are_no_sweep(tmp_path: Path) -> None:
+    trace = lae_sim.read_trace(SLOW)
+    slower = lae_sim.Trace(lae_sim.Metadata.new(15, "every-frame"), list(trace))
+    figure = lae_sim.evaluate({"a": trace, "b": slower}, forecasters="hold").plot()
+    names = [line.get_label().partition(" [")[0] for line in figure.axes[0].lines]
+    assert names == ["a: offline", "a: hold", "b: offline", "b: hold"]
+
+
+def test_notebooks_show_a_figure_without_pyplot(result: lae_sim.EvaluationResult) -> None:
+    png = result.plot()._repr_png_()  # type: ignore[attr-defined]
+    assert png.startswith(b"\x89PNG")
+
+
 def test_a_progress_bar_counts_world_frames(capsys: pytest.CaptureFixture[str]) -> None:
     lae_sim.evaluate(SLOW)
     assert capsys.readouterr() == ("", "")  # nobody looks

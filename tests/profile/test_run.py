@@ -6,11 +6,13 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from lae_sim.comparison.fidelity import compare_closed_loops, summarise_closed_loops
 from lae_sim.errors import LaeError
-from lae_sim.profile.run import ProfilePlan, run_profile
+from lae_sim.profile.passes import Failure
+from lae_sim.profile.run import Profile, ProfilePlan, profile_tracker, run_profile
 from lae_sim.trace.file import read_trace
 
 QUICK = {"sequences": ["race"], "in_process": True, "warmup": 0}
@@ -82,3 +84,43 @@ def test_passes_progress_and_closed_loops(tmp_path: Path) -> None:
     notices.clear()
     assert run_profile(ProfilePlan(), out, resume=True, notice=notices.append).traces == ()
     assert "nothing to resume" in notices[0]
+
+
+def test_a_profile_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "t.parquet"
+    settings = {"sequences": "race", "in_process": True, "warmup": "0", "strides": 1.5}
+    profile = profile_tracker("dcf", out=out, fps=29.97, **settings)
+    assert capsys.readouterr() == ("", "")  # nobody looks
+    first, strided = profile.traces
+    assert (first.trace, strided.trace) == (str(out), str(tmp_path / "t.stride3-2.parquet"))
+    trace = read_trace(out)
+    assert (trace.metadata.fps, trace.names) == (Fraction(2997, 100), ("race",))
+    assert read_trace(strided.trace).metadata.stride == Fraction(3, 2)
+    times = trace["race"].elapsed_ns[1:] / 1e6
+    assert repr(profile).startswith(
+        f"<Profile of {out}: 1 sequence, median {np.median(times):.3g} ms; {strided.trace}: "
+    )
+    table = profile.to_frame()
+    assert list(table["trace"]) == [first.trace, strided.trace]
+    assert table["median_ms"].iloc[0] == np.median(times)
+    assert profile._repr_html_().startswith("<table")
+    assert "failed" not in repr(profile)
+
+
+def test_a_profile_shows_its_progress_and_says_what_to_know(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "t.parquet"
+    profile_tracker("dcf", out=out, progress=True, **QUICK)
+    said, shown = capsys.readouterr()
+    assert said == ""
+    assert "160/160" in shown
+    again = profile_tracker("dcf", out=out, progress=True, resume=True, **QUICK)
+    assert "nothing to resume" in capsys.readouterr().err
+    assert repr(again) == "<Profile: nothing was left to do>"
+
+
+def test_a_failure_shows_in_html_as_text() -> None:
+    failed = Profile((), (Failure("<b>", "<script>"),))
+    assert "<script>" not in failed._repr_html_()
+    assert "failed: &lt;b&gt;: &lt;script&gt;" in failed._repr_html_()
