@@ -26,7 +26,7 @@ A short tour, with the traces that come with the sources:
 ``compare_forecasters`` adds intervals and tests, ``run_study`` crosses many traces, devices, rates
 and latencies, and ``profile_tracker`` makes a trace of a tracker on this device.
 
-Words that are ours:
+Words of this package:
 
 trace
     A tracker's boxes and processing times on every frame of a dataset, in a Parquet file.

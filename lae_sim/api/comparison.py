@@ -25,10 +25,11 @@ from lae_sim.engine.clock import Number, whole
 from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.metrics import find_convention
+from lae_sim.files import sequence_names
 from lae_sim.learning.registry import load_any
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
-from lae_sim.replay.world import SIGMA_GRID, World, label_of, named, several
+from lae_sim.replay.world import SIGMA_GRID, World, label_of, named
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -182,7 +183,8 @@ def compare_forecasters(
         >>> lae_sim.compare_forecasters("traces/synthetic-slow.parquet", forecasters="kalman")
         <ComparisonResult of synthetic-slow.parquet, recorded: AUC hold 0.5722, kalman 0.6291, ...>
     """
-    opened = labelled_traces(traces, sequences)
+    wanted = None if sequences is None else sequence_names(sequences)
+    opened = labelled_traces(traces, wanted)
     makers = named_forecasters(forecasters)
     if OFFLINE in makers:
         raise LaeError(
@@ -206,14 +208,13 @@ def compare_forecasters(
         costs=cost_texts(costs),
     )
     find_convention(convention)
-    if len(several(fps)) > 1 or len(several(policy)) > 1:
+    if len({(world.fps, label_of(world.policy)) for world in worlds}) > 1:
         raise LaeError("fps and policy: one of each: compare under others by themselves")
     if not scores_latency(worlds[0].rule()):
-        raise LaeError(
-            f"policy: {label_of(policy)} never scores latency: there is nothing to forecast"
-        )
+        policy_name = label_of(worlds[0].policy)
+        raise LaeError(f"policy: {policy_name} never scores latency: there is nothing to forecast")
     rate = worlds[0].fps or next(iter(opened.values())).metadata.fps
-    camera = camera_of(root, dataset, sequences, rate, camera_lag)
+    camera = camera_of(root, dataset, wanted, rate, camera_lag)
     ready: dict[str, Any] = {
         name: load_any(each, camera) if isinstance(each, str) else each
         for name, each in {"hold": "hold", **makers}.items()

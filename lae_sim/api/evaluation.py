@@ -195,14 +195,19 @@ def scenarios(
     names = None if sequences is None else list(sequences)
     for label, trace in traces.items():
         costs: dict[str, int] | None = None
+        made: dict[tuple[Fraction, str], AnyFactory] = {}  # once for all worlds of a rate
         for world in worlds:
             find_convention(world.convention)
             runs = world.replay(trace, names)
-            camera = camera_of(root, dataset, names, runs.clock.fps, camera_lag)
-            factories: dict[str, AnyFactory] = {}
-            for name in dict.fromkeys(["hold", *world.forecasters]):
+            rate, wanted = runs.clock.fps, list(dict.fromkeys(["hold", *world.forecasters]))
+            if any((rate, name) not in made for name in wanted):
+                camera = camera_of(root, dataset, names, rate, camera_lag)
+            for name in wanted:
                 each = (forecasters or {}).get(name, name)
-                factories[name] = load_forecaster(each, camera) if isinstance(each, str) else each
+                if (rate, name) not in made:
+                    loaded = load_forecaster(each, camera) if isinstance(each, str) else each
+                    made[rate, name] = loaded
+            factories = {name: made[rate, name] for name in wanted}
             if costs is None:  # measured once: a sweep is of nothing else
                 costs = resolve_costs(world.costs, factories, trace)
             found.append(Scenario(label, trace, world, runs, factories, costs))
@@ -550,7 +555,8 @@ def evaluate(
         >>> result.to_frame().groupby("forecaster")["auc"].mean().round(4).to_dict()
         {'hold': 0.5791, 'kalman': 0.6414}
     """
-    opened = labelled_traces(traces, sequences)
+    wanted = None if sequences is None else sequence_names(sequences)
+    opened = labelled_traces(traces, wanted)
     makers = named_forecasters(forecasters)
     check_frames(makers, root)
     worlds = World.sweep(
@@ -568,7 +574,7 @@ def evaluate(
         opened,
         worlds,
         forecasters=makers,
-        sequences=None if sequences is None else sequence_names(sequences),
+        sequences=wanted,
         root=root,
         dataset=dataset,
         camera_lag=camera_lag,

@@ -6,14 +6,10 @@ import argparse
 import signal
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError
-
-if TYPE_CHECKING:
-    pass
 
 PROGRAM = "lae-sim study"
 

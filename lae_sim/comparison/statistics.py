@@ -4,7 +4,7 @@ Sequences are the independent observations; frames are not. What is compared is 
 sequences and shares the bootstrap's resamples, so that differences are paired.
 
 :func:`summarise` does so in groups, one per trace, latency, scale, sigma and metric, of a tidy
-table (described at :func:`lae_sim.comparison.forecasters.compare_forecasters`).
+table (described at :func:`lae_sim.comparison.forecasters.score_forecasters`).
 """
 
 from __future__ import annotations

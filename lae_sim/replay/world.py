@@ -463,7 +463,8 @@ def _distinct(name: str, plugins: Iterable[Any]) -> list[Any]:
     found: dict[str, Any] = {}
     for each in plugins:
         label = label_of(each)
-        if label in found and not (each is found[label] or isinstance(each, (str, Plugin))):
+        known = isinstance(each, str) or hasattr(each, "label")  # which says all of it
+        if label in found and not (known or each is found[label]):
             raise LaeError(f"{name}: two are called {label!r}: give functions names")
         found.setdefault(label, each)
     return list(found.values())
@@ -501,7 +502,7 @@ def _number(text: str, value: str, least: int = 0) -> int:
         raise LaeError(f"{text!r} needs a whole number from {least} after the colon") from error
 
 
-def _check_kinds(name: str, values: Iterable[object], kinds: tuple[type, ...], what: str) -> None:
+def _check_kinds(name: str, values: Iterable[object], kinds: tuple[Any, ...], what: str) -> None:
     for value in values:
         if not isinstance(value, kinds):
             raise LaeError(f"{name}: {shown(value)} is not {what}")

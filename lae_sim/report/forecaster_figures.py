@@ -49,9 +49,9 @@ def overview(summary: pd.DataFrame, metric: str = "auc") -> Figure:
     answering = [name for name in styles if name != "offline"]
     forecasting = [name for name in answering if name != "hold"]
     for (left, right), trace in zip(rows, traces):
-        ours = chosen[chosen["trace"] == trace]
+        of_trace = chosen[chosen["trace"] == trace]
         for name, style in styles.items():
-            one = ours[ours["forecaster"] == name].set_index("setting").reindex(settings)
+            one = of_trace[of_trace["forecaster"] == name].set_index("setting").reindex(settings)
             if name == "offline":
                 known = one["mean"].notna().to_numpy()
                 ends = places[known] - 0.42, places[known] + 0.42
@@ -63,7 +63,7 @@ def overview(summary: pd.DataFrame, metric: str = "auc") -> Figure:
                     right, places + _offset(forecasting, name), one, "recovered", 100, name, style
                 )
         right.axhline(0, color="0.4", linewidth=0.8)
-        if ours["recovered"].isna().all():
+        if of_trace["recovered"].isna().all():
             right.text(
                 0.5, 0.5, "not known: no offline scores", transform=right.transAxes, ha="center"
             )

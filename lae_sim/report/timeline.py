@@ -135,9 +135,9 @@ def trace_events(
     def mark(phase: str, track: int, tick: int, **more: Any) -> TraceEvent:
         return {"ph": phase, "pid": process, "tid": track, "ts": shown_ns(tick) / 1000, **more}
 
-    def span(track: int, name: str, start: int, end: int, **its: Any) -> TraceEvent:
+    def span(track: int, name: str, start: int, end: int, **details: Any) -> TraceEvent:
         length_ns = shown_ns(end) - shown_ns(start)
-        return mark("X", track, start, dur=length_ns / 1000, name=name, args=its)
+        return mark("X", track, start, dur=length_ns / 1000, name=name, args=details)
 
     yield from named("process", process, run.recording.name)
     camera, tracker = next(tracks), next(tracks)
@@ -146,14 +146,14 @@ def trace_events(
     for frame in range(schedule.length):
         skipped = frame not in processed
         tick = frame * interval
-        its = {"frame": frame, "skipped": skipped, "tick": tick}
+        details = {"frame": frame, "skipped": skipped, "tick": tick}
         name = f"skipped {frame}" if skipped else f"frame {frame}"
-        yield span(camera, name, tick, tick + interval, **its)
+        yield span(camera, name, tick, tick + interval, **details)
     yield from named("thread", tracker, "tracker")
     start, ready = schedule.start.tolist(), schedule.ready.tolist()
     for frame, begin, end in zip(schedule.frames.tolist(), start, ready):
-        its = {"frame": frame, "start_ticks": begin, "ready_ticks": end}
-        yield span(tracker, f"frame {frame}", begin, end, **its)
+        details = {"frame": frame, "start_ticks": begin, "ready_ticks": end}
+        yield span(tracker, f"frame {frame}", begin, end, **details)
 
     free = pairings[0].first[:, 0]
     for cost_ns in dict.fromkeys(costs.values()):
@@ -161,25 +161,25 @@ def trace_events(
         first, end_frame = pairing.first[:, 0], pairing.end[:, 0]
         used = (end_frame > first).nonzero()[0].tolist()
         spans = [(k, int(pairing.frames[k]), int(first[k]), int(end_frame[k])) for k in used]
-        names = [name for name, its in costs.items() if its == cost_ns]
+        names = [name for name, cost in costs.items() if cost == cost_ns]
         for name in names:
             track = next(tracks)
             yield from named("thread", track, f"forecaster {name}")
             for k, source, begin, end in spans:
-                its = {"source_frame": source, "tick": query(begin)}
+                details = {"source_frame": source, "tick": query(begin)}
                 if cost_ns:
-                    its |= {"cost_ns": cost_ns, "delayed_queries": begin - int(free[k])}
+                    details |= {"cost_ns": cost_ns, "delayed_queries": begin - int(free[k])}
                 state = f"update {source}" if source else "initial box"
-                yield span(track, state, query(begin), query(end), **its)
+                yield span(track, state, query(begin), query(end), **details)
         track = next(tracks)
         shared = len(names) == len(costs)
         yield from named("thread", track, "queries" if shared else f"queries {', '.join(names)}")
         for k, source, begin, end in spans:
             for frame in range(begin, end):
-                its = {"frame": frame, "source_frame": source, "age_frames": frame - source}
-                its |= {"tick": query(frame)}
+                details = {"frame": frame, "source_frame": source, "age_frames": frame - source}
+                details |= {"tick": query(frame)}
                 answer = f"{source} answers {frame}"
-                yield span(track, answer, query(frame), query(frame + 1), **its)
+                yield span(track, answer, query(frame), query(frame + 1), **details)
                 if frame == begin and source:
                     flow = {"id": next(flows), "cat": "answer", "name": "answers"}
                     yield mark("s", tracker, start[k], **flow)

@@ -6,7 +6,6 @@ again, and one whose input has changed is not. Cells of the same replay are comp
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from lae_sim.evaluation.caveats import notes_on
 from lae_sim.evaluation.evaluate import ReplayStatistics, evaluate_groups
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.evaluation.totals import CurveTotals
+from lae_sim.files import text_digest
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes
 from lae_sim.replay.latency import RandomSource
@@ -158,7 +158,7 @@ class Cell:
             "cost_ns": self.cost_ns,
             "convention": self.convention,
         }
-        return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:32]
+        return text_digest(json.dumps(document, sort_keys=True))
 
     def about(self, metadata: Metadata) -> dict[str, str]:
         """The columns that are the same in all its rows."""

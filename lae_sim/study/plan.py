@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +10,7 @@ from pathlib import Path
 
 from lae_sim.comparison.forecasters import fitted
 from lae_sim.errors import LaeError
-from lae_sim.files import labels
+from lae_sim.files import labels, text_digest
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import resolve_costs
 from lae_sim.learning.folds import Trainer
@@ -136,13 +135,13 @@ def tasks(cells: Iterable[Cell], factories: Mapping[str, AnyFactory]) -> list[Ta
 
 def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Setting]:
     """All ways in which a trace is replayed."""
-    theirs = [other.input for other in timing if _same_runs(source, other)]
+    other_times = [other.input for other in timing if _same_runs(source, other)]
     codes = {name: _own_code(name) for name in (*study.policies, *study.latencies)}
     rates = dict.fromkeys(source.metadata.fps if fps is None else fps for fps in study.fps)
     found = []
     chunk = max(1, CHUNK_FRAMES // (max(source.frames, 1) * max(1, len(study.sigmas) // 8)))
     for times, policy, fps, latency, scale in product(
-        [None, *theirs], study.policies, rates, study.latencies, study.scales
+        [None, *other_times], study.policies, rates, study.latencies, study.scales
     ):
         world = World(
             fps=fps,
@@ -171,8 +170,8 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
 
 def _same_runs(source: Source, other: Source) -> bool:
     """Whether two traces are of one tracker on one dataset, on different devices."""
-    ours, theirs = source.metadata, other.metadata
-    same = (ours.tracker, ours.dataset) == (theirs.tracker, theirs.dataset)
+    one, another = source.metadata, other.metadata
+    same = (one.tracker, one.dataset) == (another.tracker, another.dataset)
     return same and source.input.path != other.input.path
 
 
@@ -180,8 +179,8 @@ def _training(study: Study, traces: Sequence[Source]) -> str:
     """Digest of what trained forecasters depend on."""
     document = study.document()
     keys = ("latencies", "scales", "fps", "policies", "sequences", "folds", "seed")
-    told = [*(document[key] for key in keys), *(source.input.digest for source in traces)]
-    return hashlib.sha256(repr(told).encode()).hexdigest()[:32]
+    values = [*(document[key] for key in keys), *(source.input.digest for source in traces)]
+    return text_digest(repr(values))
 
 
 def _code(name: str, forecaster: AnyFactory | Trainer, training: str) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import subprocess
 import sys
+import types
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -250,14 +252,52 @@ class EverySecond:
 def test_a_policy_of_ones_own_and_a_latency_of_ones_own() -> None:
     result = lae_sim.evaluate(SLOW, policy=[EverySecond(), "every:2", every(2)])
     assert result.summary["auc"].nunique() == 2  # of hold and of kalman
-    assert set(result.summary["policy"]) == {"EverySecond", "every:2", "_Every"}
+    assert set(result.summary["policy"]) == {"EverySecond", "every:2"}
 
     def forty_seven(recording: lae_sim.Recording) -> Any:
         return lambda frame: 47_000_000
 
     own = lae_sim.evaluate(SLOW, latency=[forty_seven, constant("47ms"), "constant:47ms"])
     assert own.summary["auc"].nunique() == 2
-    assert own.summary["latency"].iloc[0] == "forty_seven"
+    assert list(own.summary["latency"].unique()) == ["forty_seven", "constant:47ms"]
+    with pytest.raises(lae_sim.LaeError, match="latency: two are called '<lambda>'"):
+        lae_sim.evaluate(SLOW, latency=[lambda r: int, lambda r: abs])
+
+
+class Counted:
+    """A latency that its first call decides: another one for each time that it is made."""
+
+    made = 0
+
+    def __init__(self) -> None:
+        Counted.made += 1
+
+    def __call__(self, recording: lae_sim.Recording) -> Any:
+        return lambda frame: 47_000_000
+
+
+def test_a_plug_in_is_made_once_for_all_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "counted", types.SimpleNamespace(Counted=Counted))
+    Counted.made = 0
+    result = lae_sim.evaluate(SLOW, latency="counted:Counted", scale=[1, 2, 3])
+    assert Counted.made == 1
+    assert set(result.summary["latency"]) == {"counted:Counted"}
+
+
+def test_iterators_are_read_once() -> None:
+    names = ["boat-calm", "car-chase"]
+    result = lae_sim.evaluate(SLOW, sigma=iter([0, 0.5]), scale=iter([1, 2]), sequences=iter(names))
+    table = result.to_frame()
+    assert set(table["sequence"]) == set(names)
+    assert set(table["sigma"]) == {0.0, 0.5}
+
+
+def test_a_world_can_be_sent_to_a_worker() -> None:
+    world = lae_sim.World.of(latency=constant("47ms"), policy=every(2), scale=1.5)
+    assert pickle.loads(pickle.dumps(world)) == world
+    assert hash(world) == hash(
+        lae_sim.World.of(latency=constant("47ms"), policy=every(2), scale=1.5)
+    )
 
 
 class Drift:
