@@ -58,8 +58,8 @@ The names of this package are imported from their modules when they are first us
 ``lae_sim.engine`` to ``lae_sim.report``.
 """
 
-import lazy_loader
+from lae_sim._faces import lazy_face
 
 __version__ = "0.1.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.api.inputs import (
@@ -125,6 +124,8 @@ class ComparisonResult:
         return " ".join(f"<ComparisonResult of {setting}: AUC {scores}>".split())
 
     def _repr_html_(self) -> str:
+        from html import escape
+
         table = self.summary[self.summary["metric"] == self.metrics[0]]
         settings = ("trace", "latency", "scale", "sigma")
         shown = [

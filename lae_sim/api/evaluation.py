@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -398,6 +397,8 @@ class EvaluationResult:
         return " ".join(f"<EvaluationResult of {setting}{more}: AUC {scores}>".split())
 
     def _repr_html_(self) -> str:
+        from html import escape
+
         table = self.summary
         shown = [
             *(name for name in SETTING if table[name].nunique() > 1 or name == "trace"),

@@ -69,6 +69,13 @@ class _ByLastCall(ABC):
 class _Latest(_ByLastCall):
     label: ClassVar[str] = "latest"
 
+    def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
+        last, _, now = calls[-1]  # of most replays, so without the rule's detours
+        newest = now // clock.frame_ticks
+        if newest > last:
+            return newest, now
+        return last + 1, (last + 1) * clock.frame_ticks
+
     def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
         return _later(now // clock.frame_ticks, last + 1)
 
