@@ -449,13 +449,11 @@ def _sequence_table(
 
 
 def _exactness(part: Evaluated) -> list[str]:
-    replay = part.totals.replay
-    departures = int(replay.departures.sum())
-    if not departures:
+    share = part.totals.replay.approximate_share
+    if not share:
         return []
-    calls = int((replay.processed - 1).sum())
     return [
-        f"approximate: {100 * departures / calls:.3g}% of the outputs follow another frame than "
+        f"approximate: {100 * share:.3g}% of the outputs follow another frame than "
         "when recorded; a tracker that searches near its last answer would do worse"
     ]
 
@@ -482,13 +480,13 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
     title = "" if "trace" in several else f"{first.label}: "
     title += f"sigma {sigma_text(at)}, convention {first.world.convention}"
     runs = [tuple(setting[name] for name in several) for setting in settings]
-    reports = [part.document() for part in parts]
     swept = [
         key
-        for key in ("fps", "latency_scale")
-        if len({(run, each[key]) for run, each in zip(runs, reports)}) > len(set(runs))
+        for key, name in (("fps", "fps"), ("latency_scale", "scale"))
+        if len({(run, each[name]) for run, each in zip(runs, settings)}) > len(set(runs))
     ]
     if swept:
+        reports = [part.document() for part in parts]
         names = [", ".join(run) for run in runs]
         return figures.sweep_figure(reports, names, float(at), swept, title)
     curves = {}

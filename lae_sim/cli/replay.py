@@ -120,8 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _replay(arguments: argparse.Namespace) -> None:
     import json
 
-    from lae_sim import __version__
-    from lae_sim.api.evaluation import plot_evaluations, scenario_bar, scenarios
+    from lae_sim.api.evaluation import EvaluationResult, plot_evaluations, scenario_bar, scenarios
     from lae_sim.engine.scheduler import scores_latency
     from lae_sim.replay.world import SIGMA_GRID
     from lae_sim.trace.file import read_trace
@@ -162,7 +161,7 @@ def _replay(arguments: argparse.Namespace) -> None:
         check_format(arguments.plot)
     observed = list(product(arguments.forecaster, arguments.sigma))
     with ExitStack() as files, scenario_bar(asked) as advance:  # a failure leaves no file behind
-        scored = [
+        scored = tuple(
             scenario.evaluate(
                 attributes=arguments.attributes,
                 sequences=arguments.per_sequence,
@@ -172,18 +171,19 @@ def _replay(arguments: argparse.Namespace) -> None:
                 progress=advance,
             )
             for scenario in asked
-        ]
+        )
         if arguments.plot:
             from lae_sim.report.style import save
 
             save(plot_evaluations(scored, arguments.sigma[0]), arguments.plot)
-    reports = [each.document(arguments.attributes, arguments.per_sequence) for each in scored]
+    result = EvaluationResult(scored)
+    document = result.document(arguments.attributes, arguments.per_sequence)
     if arguments.json:
-        document = {"format": "lae-replay", "version": "1.0", "lae_sim": __version__}
-        json.dump({**document, "traces": reports}, sys.stdout, indent=2, allow_nan=False)
+        json.dump(document, sys.stdout, indent=2, allow_nan=False)
         print()
     else:
-        _print_tables(reports, [scenario.label for scenario in asked], swept, arguments)
+        trace_labels = [scenario.label for scenario in asked]
+        _print_tables(document["traces"], trace_labels, swept, arguments)
 
 
 def _check_files(arguments: argparse.Namespace, swept: Sequence[str]) -> None:

@@ -134,12 +134,10 @@ def steps(
 def _notes(where: str, found: Evaluation, costs: Mapping[str, int]) -> list[str]:
     """What keeps the figures of one replay from being what they seem."""
     notes = []
-    calls = int(found.replay.processed.sum()) - len(found.replay.sequences)
-    if found.replay.departures.any():
-        share = 100 * found.replay.departures.sum() / calls
+    if share := found.replay.approximate_share:
         notes.append(
-            f"{where}: approximate, {share:.3g}% of the outputs follow another frame than when "
-            "recorded"
+            f"{where}: approximate, {100 * share:.3g}% of the outputs follow another frame than "
+            "when recorded"
         )
     return notes + [f"{where}: {note}" for note in cost_notes(costs)]
 

@@ -89,8 +89,7 @@ def parse_duration(text: str) -> int:
     """
     match = _DURATION.match(text) if isinstance(text, str) else None
     if match is None:
-        shown = repr(text[:40] if isinstance(text, str) else text)
-        raise LaeError(f"{shown} is not a duration: write it with its unit, such as 47ms")
+        raise LaeError(f"{shown(text)} is not a duration: write it with its unit, such as 47ms")
     duration = Fraction(match[1]) * UNIT_NS[match[2]]
     if duration.denominator != 1:
         raise LaeError(f"{text!r} is not a whole number of nanoseconds")

@@ -59,6 +59,12 @@ class ReplayStatistics:
     calls_ns: Ints
     calls_hz: Floats
 
+    @property
+    def approximate_share(self) -> float:
+        """Share of the outputs that follow another frame than when recorded, in 0..1."""
+        calls = int(self.processed.sum()) - len(self.sequences)
+        return int(self.departures.sum()) / calls if calls else 0.0
+
     @classmethod
     def joined(cls, parts: Sequence[ReplayStatistics]) -> ReplayStatistics:
         """Those of some groups of sequences as one."""

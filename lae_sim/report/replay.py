@@ -104,7 +104,7 @@ def trace_report(
         "init_ms": float(np.mean(replay.init_ns)) / 1e6,
         "exact": departures == 0,
         "approximate_outputs": departures,
-        "approximate_share": departures / calls if calls else 0.0,
+        "approximate_share": replay.approximate_share,
         "offline": None if offline["auc"] is None else offline,
         "results": results,
     }
