@@ -44,3 +44,21 @@ def _shared(a: Floats, a_side: Floats, b: Floats, b_side: Floats) -> Floats:
 def centre(boxes: Floats) -> Floats:
     """Centre pixel ``(x + (w-1)/2, y + (h-1)/2)`` as the pysot toolkit has it, float64 [n, 2]."""
     return boxes[:, :2] + (boxes[:, 2:] - 1.0) / 2.0
+
+
+def search_side(boxes: Floats) -> Floats:
+    """Side of the square that a Siamese tracker's exemplar covers, pixels: the unit of a reach.
+
+    ``a = sqrt((w + p)(h + p))`` with ``p = (w + h) / 2`` (Bertinetto et al., "Fully-Convolutional
+    Siamese Networks for Object Tracking", 2016, sec. 2.2).
+
+    Args:
+        boxes: float64 [..., 4].
+
+    Returns:
+        float64 [...]; NaN where the box is.
+    """
+    w, h = boxes[..., 2], boxes[..., 3]
+    context = (w + h) / 2
+    side: Floats = np.sqrt((w + context) * (h + context))
+    return side

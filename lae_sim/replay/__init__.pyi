@@ -9,6 +9,7 @@ from .latency import (
     resampled,
     scaled,
 )
+from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
 from .run import Run, Runs, replay_repeated, replay_sequence
 from .strides import followed, phases
 from .world import (
@@ -24,7 +25,10 @@ from .world import (
 __all__ = [
     "SIGMA_GRID",
     "LatencySource",
+    "OwnJump",
     "RandomSource",
+    "Reach",
+    "Restart",
     "Run",
     "Runs",
     "TraceLike",
@@ -33,8 +37,10 @@ __all__ = [
     "by_call",
     "by_frame",
     "constant",
+    "fit_reach",
     "followed",
     "lognormal",
+    "own_jumps",
     "parse_latency",
     "parse_policy",
     "parse_sigmas",
@@ -43,5 +49,6 @@ __all__ = [
     "replay_sequence",
     "replay_trace",
     "resampled",
+    "restarts_of",
     "scaled",
 ]

@@ -17,7 +17,7 @@ from lae_sim.errors import LaeError, TraceError
 
 FORMAT = "lae-trace"
 VERSION = "1.0"
-KINDS = ("every-frame", "real-time")
+KINDS = ("every-frame", "real-time", "restarts")
 
 
 @dataclass(frozen=True, repr=False)
@@ -26,7 +26,7 @@ class Metadata:
 
     Attributes:
         fps: world frame rate, frames per second, exact.
-        kind: ``"every-frame"`` or ``"real-time"``.
+        kind: ``"every-frame"``, ``"real-time"`` or ``"restarts"``.
         document: the whole JSON object (see ``traces/FORMAT.md``).
 
     Example:
@@ -52,7 +52,7 @@ class Metadata:
 
         Args:
             fps: the frame rate, such as ``30`` or ``"30000/1001"``; text is kept as it is.
-            kind: ``"every-frame"`` or ``"real-time"``.
+            kind: ``"every-frame"``, ``"real-time"`` or ``"restarts"``.
             more: optional keys: ``tracker``, ``device``, ``timing``, ``dataset``, ``sequences``;
                 ``schedule`` adds to the schedule object.
 
