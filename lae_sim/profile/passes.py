@@ -21,7 +21,7 @@ from lae_sim.profile.live import Live, LiveRun
 from lae_sim.profile.timed import TimedTracker, TrackerError
 from lae_sim.replay.latency import by_frame
 from lae_sim.trace.file import Trace, read_trace, write_trace
-from lae_sim.trace.metadata import FORMAT, VERSION, Metadata
+from lae_sim.trace.metadata import FORMAT, Metadata, version_of
 
 READING_INTERVAL_S = 10.0
 
@@ -132,7 +132,6 @@ def base_document(
     measured = {k: described.pop(k) for k in ("synchronised", "threads") if k in described}
     return {
         "format": FORMAT,
-        "version": VERSION,
         "fps": str(clock.fps),
         "tracker": {"name": name, **described},
         "device": {**describe_device(), "readings": {"before": readings()}},
@@ -157,8 +156,14 @@ def scheduled(document: Mapping[str, Any], source: str = "measured", **schedule:
         schedule: keys of the metadata's schedule, ``kind`` among them.
     """
     timing = {"source": source, **document["timing"]}
+    version = version_of(schedule["kind"])
     return Metadata.of(
-        {**document, "timing": timing, "schedule": {**schedule, **document["schedule"]}}
+        {
+            **document,
+            "version": version,
+            "timing": timing,
+            "schedule": {**schedule, **document["schedule"]},
+        }
     )
 
 

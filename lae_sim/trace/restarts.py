@@ -10,6 +10,11 @@ from lae_sim.errors import TraceError
 _NAME = re.compile(r"(.+)@(0|[1-9][0-9]{0,8})\+([1-9][0-9]{0,8})", re.DOTALL)
 
 
+def is_restart(name: str) -> bool:
+    """Whether a sequence's name is a restart's."""
+    return _NAME.fullmatch(name) is not None
+
+
 class RestartName(NamedTuple):
     """Where a tracker was started anew, and where it went on.
 
