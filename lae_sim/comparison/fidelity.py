@@ -139,12 +139,12 @@ def _rows(
         )
     names = [recording.name for recording in closed]
     every, *others = map(read_trace, replayed)
-    passes, gaps = split_passes(others)
-    for trace in (every, *passes, *gaps):
+    strided, gaps = split_passes(others)
+    for trace in (every, *strided, *gaps):
         _check_same_tracker(closed, trace)
-    if not all(trace.metadata.kind == "every-frame" for trace in (every, *passes)):
+    if not all(trace.metadata.kind == "every-frame" for trace in (every, *strided)):
         raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
-    every, *passes = (trace.chosen(names) for trace in (every, *passes))
+    every, *passes = (trace.chosen(names) for trace in (every, *strided))
     schedule = closed.metadata.document["schedule"]
     policy = parse_policy(schedule.get("policy", "latest"))
 

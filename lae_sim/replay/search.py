@@ -27,7 +27,6 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou, search_side
-from lae_sim.engine.clock import exact
 from lae_sim.errors import LaeError
 from lae_sim.forecast.base import AnyFactory, Forecaster, ImageSize, factory_for
 from lae_sim.replay.reach import (
@@ -98,8 +97,11 @@ def parse_search(text: str) -> str | ReachRange:
 
 
 def _reach(text: str) -> float:
-    value = inf if text.strip() == "inf" else float(exact(text))
-    if value < 0:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise LaeError(f"{text!r} is no number") from error
+    if not value >= 0:
         raise LaeError(f"a reach cannot be {text}")
     return value
 
@@ -355,13 +357,20 @@ def find_search(
         pre_forecaster, keep_size: see :class:`SearchModel`.
 
     Returns:
-        None if the model is off.
+        None if the model is off, or the trace was recorded with a pre-forecaster.
 
     Raises:
-        LaeError: if the text is no search, or a trace is damaged.
+        LaeError: if the text is no search, a trace is damaged, or both trace and replay have a
+            pre-forecaster.
     """
     asked = parse_search(text)
-    if asked == "off":
+    searched = metadata.document["schedule"].get("pre_forecaster")
+    if searched is not None and pre_forecaster is not None:
+        raise LaeError(
+            f"the trace was recorded with the pre-forecaster {searched!r}: another one goes with a "
+            "trace that was recorded without"
+        )
+    if asked == "off" or searched is not None:  # the model would have to search where that one did
         return None
     reach: Reach | None = None
     jumps: dict[str, list[OwnJump]] = {}

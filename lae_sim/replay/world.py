@@ -293,13 +293,14 @@ def replay_trace(
     scale: Number = 1,
     timing: TraceLike | None = None,
     passes: TraceLike | Iterable[TraceLike] = (),
+    search: str = "trace",
     batch: bool = False,
 ) -> Runs:
     """Replay every sequence of a trace, one after another.
 
     Args:
         trace: the boxes and the truth: an open trace, or the path or URL of one.
-        fps, policy, latency, scale, timing, passes: see :meth:`World.of`.
+        fps, policy, latency, scale, timing, passes, search: see :meth:`World.of`.
         batch: see :meth:`World.replay`.
 
     Returns:
@@ -321,6 +322,7 @@ def replay_trace(
         policy=policy,
         latency=latency,
         scale=scale,
+        search=search,
         **open_others(timing, passes),
     )
     return world.replay(opened, batch=batch)
