@@ -157,6 +157,13 @@ def own_jumps(trace: Trace) -> dict[str, list[OwnJump]]:
     return {name: sorted(each, key=lambda jump: jump.gap) for name, each in jumps.items()}
 
 
+def split_passes(passes: Iterable[Trace]) -> tuple[tuple[Trace, ...], tuple[Trace, ...]]:
+    """Passes of every N-th frame, and gap passes, told apart by their metadata."""
+    every = tuple(passes)
+    gaps = tuple(trace for trace in every if trace.metadata.kind == "restarts")
+    return tuple(trace for trace in every if trace not in gaps), gaps
+
+
 def fit_reach(restarts: Iterable[Restart]) -> Reach | None:
     """The reach that restarts show, by maximum likelihood with a weak prior.
 

@@ -18,6 +18,7 @@ from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
 from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
+from lae_sim.replay.reach import split_passes
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
 from lae_sim.trace.recording import Recording, batched
@@ -193,13 +194,15 @@ class Runs:
         source: how to take processing times from a recording.
         policy: which frame is processed next.
         timing: another device's trace to take the times from; it must have the same sequences.
-        passes: traces of the same tracker at other strides (see :func:`replay_sequence`).
+        passes: further traces of the same tracker: at other strides (see
+            :func:`replay_sequence`), and gap passes.
         batch: schedule many sequences at once where source and policy allow it (see
             :func:`lae_sim.engine.lanes.batchable`). The runs are the same, and come in groups.
 
     Raises:
-        LaeError: if two passes have the same stride; while one goes through the runs, if a
-            sequence or frame that is asked for is not there, or policy or source raise something.
+        LaeError: if two passes have the same stride, or the trace is a gap pass; while one goes
+            through the runs, if a sequence or frame that is asked for is not there, or policy or
+            source raise something.
 
     Example:
         >>> import lae_sim
@@ -219,13 +222,23 @@ class Runs:
     batch: bool = False
 
     def __post_init__(self) -> None:
-        strides = [trace.metadata.stride for trace in (self.trace, *self.passes)]
-        if self.passes and len(set(strides)) != len(strides):
+        if self.trace.metadata.kind == "restarts":
+            raise LaeError(
+                f"{self.trace!r} is a gap pass, which measures a tracker's reach: "
+                "give it to --strided (passes) of a trace of every frame"
+            )
+        strides = [trace.metadata.stride for trace in (self.trace, *self.strided)]
+        if self.strided and len(set(strides)) != len(strides):
             raise LaeError("two of the passes have the same stride: give each stride once")
+
+    @property
+    def strided(self) -> tuple[Trace, ...]:
+        """The passes at other strides."""
+        return split_passes(self.passes)[0]
 
     def __iter__(self) -> Iterator[Run]:
         frames = _GROUP_FRAMES if self.batch else 1
-        for jobs in batched(_jobs(self.trace, self.timing, self.passes), frames):
+        for jobs in batched(_jobs(self.trace, self.timing, self.strided), frames):
             with explained("latency"):
                 services = [self.source(job.times) for job in jobs]
             yield from _replayed(jobs, self.clock, services, self.policy)
@@ -238,8 +251,8 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
     """Replay a trace again and again, under other random times in each repetition.
 
     Args:
-        runs: of a trace with random times, without passes; the repetition of their source does not
-            count.
+        runs: of a trace with random times, without strided passes; the repetition of their source
+            does not count.
         count: number of repetitions.
         first: the first repetition.
 
@@ -253,7 +266,7 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
             there.
     """
     source = runs.source
-    if not isinstance(source, RandomSource) or runs.passes:
+    if not isinstance(source, RandomSource) or runs.strided:
         raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
     for jobs in batched(_jobs(runs.trace, runs.timing), _GROUP_FRAMES):
         size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)

@@ -20,6 +20,7 @@ from lae_sim.files import sequence_names
 from lae_sim.plugins import bound, imported
 from lae_sim.replay import latency as sources
 from lae_sim.replay.latency import LatencySource, scaled
+from lae_sim.replay.reach import split_passes
 from lae_sim.replay.run import Runs
 from lae_sim.trace.file import Trace, read_trace
 
@@ -73,7 +74,7 @@ class World:
         scale: exact factor on all times.
         timing: another device's trace of the same sequences, to take the times from.
         passes: traces of the same tracker at other strides, one of which each sequence's boxes
-            come from (see :func:`lae_sim.replay.run.replay_sequence`).
+            come from (see :func:`lae_sim.replay.run.replay_sequence`), and gap passes.
         sigmas: permitted latencies in frames, ascending.
         convention: how frames and thresholds count, by name.
         forecasters: names.
@@ -242,13 +243,14 @@ class World:
         """
         names = None if sequences is None else sequence_names(sequences)
         opened = open_trace(trace, names)
+        strided, gaps = split_passes(map(open_trace, self.passes))
         return Runs(
             opened,
             Clock.at(opened.metadata.fps if self.fps is None else self.fps),
             scaled(self.source(), self.scale),
             self.rule(),
             None if self.timing is None else open_trace(self.timing),
-            tuple(open_trace(each, names) for each in self.passes),
+            (*(each if names is None else each.chosen(names) for each in strided), *gaps),
             batch,
         )
 
