@@ -182,7 +182,8 @@ def evenly(total: int, available: Ints) -> Ints:
 def _valid(truth: Floats) -> Bools:
     """Whether each truth is there and has a size, bool [T]."""
     x, y, w, h = truth.T
-    return np.isfinite(x + y + w + h) & (w > 0) & (h > 0)
+    valid: Bools = np.isfinite(x + y + w + h) & (w > 0) & (h > 0)
+    return valid
 
 
 def _pairs(truth: Floats) -> tuple[Ints, Ints, Floats]:
