@@ -139,12 +139,13 @@ def _rows(
         )
     names = [recording.name for recording in closed]
     every, *others = map(read_trace, replayed)
-    strided, gaps = split_passes(others)
-    for trace in (every, *strided, *gaps):
+    passes, gaps = split_passes(others)
+    for trace in (every, *passes, *gaps):
         _check_same_tracker(closed, trace)
-    if not all(trace.metadata.kind == "every-frame" for trace in (every, *strided)):
+    if not all(trace.metadata.kind == "every-frame" for trace in (every, *passes)):
         raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
-    every, *passes = (trace.chosen(names) for trace in (every, *strided))
+    every = every.chosen(names)
+    passes = tuple(trace.chosen(names) for trace in passes)
     schedule = closed.metadata.document["schedule"]
     policy = parse_policy(schedule.get("policy", "latest"))
 
@@ -156,7 +157,7 @@ def _rows(
     closed_runs = list(Runs(closed, clock, policy=policy))
     replays = {"every-frame": list(Runs(every, clock, policy=policy, timing=closed))}
     if passes:
-        strided = Runs(every, clock, policy=policy, timing=closed, passes=tuple(passes))
+        strided = Runs(every, clock, policy=policy, timing=closed, passes=passes)
         replays["strided"] = list(strided)
     closed_scores = scores(closed_runs)
     for kind, runs in replays.items():

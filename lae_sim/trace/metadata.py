@@ -259,7 +259,7 @@ def _check_search(search: Any) -> None:
             f"{where}.half_side' must be a number above 0, in units of sqrt((w + p)(h + p)), "
             "p = (w + h) / 2, such as 1.0"
         )
-    if not isinstance(search.get("window", False), bool):
+    if not isinstance(search.get("window"), (bool, type(None))):
         raise TraceError(f"{where}.window' must be true or false")
-    if not isinstance(search.get("source", ""), str):
+    if not isinstance(search.get("source"), (str, type(None))):
         raise TraceError(f"{where}.source' must be text: where the number is from")
