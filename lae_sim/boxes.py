@@ -44,3 +44,26 @@ def _shared(a: Floats, a_side: Floats, b: Floats, b_side: Floats) -> Floats:
 def centre(boxes: Floats) -> Floats:
     """Centre pixel ``(x + (w-1)/2, y + (h-1)/2)`` as the pysot toolkit has it, float64 [n, 2]."""
     return boxes[:, :2] + (boxes[:, 2:] - 1.0) / 2.0
+
+
+def search_distance(searched: Floats, boxes: Floats) -> Floats:
+    """How far boxes lie from where a tracker searches for them: at 1, at the region's edge.
+
+    A tracker of SiamFC's kind searches a square around its last box w x h, whose half side is
+    a = sqrt((w + p)(h + p)), p = (w + h)/2 (Bertinetto et al., "Fully-Convolutional Siamese
+    Networks for Object Tracking", 2016, Eq. 15 and twice that side).
+
+    Args:
+        searched: the last boxes, float64 [n, 4].
+        boxes: where the target is, float64 [n, 4].
+
+    Returns:
+        The larger of |dx| and |dy| of the centres over a, float64 [n]; NaN where a box is NaN or
+        the last one has no size.
+    """
+    offset = np.abs(centre(boxes) - centre(searched)).max(axis=1)
+    w, h = searched[:, 2], searched[:, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance: Floats = offset / np.sqrt((w + (w + h) / 2) * (h + (w + h) / 2))
+    distance[~((w > 0) & (h > 0))] = np.nan
+    return distance

@@ -41,6 +41,7 @@ from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import TraceLike, World, label_of, named, open_others
 from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
+from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class Scenario:
         """
         metadata, convention = self.trace.metadata, find_convention(self.world.convention)
         stalls = SkippedStalls()
-        if self.world.latency == "recorded" and self.world.timing is None:
+        if self.world.times_kind == "recorded" and self.world.timing is None:
             observers = [*observers, stalls]
 
         def runs() -> Iterator[Run]:
@@ -135,6 +136,11 @@ class Evaluated:
     rows: SequenceRows
     notes: tuple[str, ...]
 
+    @property
+    def init(self) -> InitCost:
+        """What initialisations cost."""
+        return self.scenario.world.init_cost(self.scenario.runs, self.totals.replay.init_ns)
+
     def document(self, attributes: bool = False, per_sequence: bool = False) -> dict[str, Any]:
         """The scores as a JSON object, as ``lae-sim replay --json`` has them."""
         scenario, world = self.scenario, self.scenario.world
@@ -162,6 +168,7 @@ class Evaluated:
                 list(scenario.forecasters),
                 world.sigmas,
                 world.convention,
+                self.init,
                 self.rows if per_sequence else None,
                 attributes,
             ),
@@ -288,7 +295,7 @@ class EvaluationResult:
         notes = [
             (f"{part.scenario.label}: " if several else "") + note
             for part in self.parts
-            for note in (*part.notes, *_exactness(part))
+            for note in (*part.notes, *_assumption(part), *_exactness(part))
         ]
         return list(dict.fromkeys(notes))
 
@@ -446,6 +453,10 @@ def _sequence_table(
     shape = tuple(map(len, axes))
     flat = {name: np.broadcast_to(values, shape).ravel() for name, values in columns.items()}
     return pd.DataFrame(flat, index).reset_index()
+
+
+def _assumption(part: Evaluated) -> list[str]:
+    return [] if part.init.is_measured else [str(part.init)]
 
 
 def _exactness(part: Evaluated) -> list[str]:

@@ -18,6 +18,7 @@ from lae_sim.errors import LaeError, TraceError
 FORMAT = "lae-trace"
 VERSION = "1.0"
 KINDS = ("every-frame", "real-time")
+TRACES_TIMES = "the trace's times: "
 
 
 @dataclass(frozen=True, repr=False)
@@ -135,6 +136,17 @@ class Metadata:
         """What the trace says of times that were not measured, if it does."""
         note = self.document.get("timing", {}).get("source")
         return None if note in (None, "measured") else str(note)
+
+    @property
+    def init_source(self) -> str:
+        """``"measured"``, if the times of initialisations are, or what the trace says of them."""
+        timing = self.document.get("timing", {})
+        source, note = timing.get("source"), timing.get("note")
+        if source is None:
+            source = "measured" if self.profiled else "of unknown origin"
+        if source == "measured" and note is None:
+            return "measured"
+        return f"{TRACES_TIMES}{source}" + ("" if note is None else f"; {note}")
 
     @property
     def names_attributes(self) -> bool:
