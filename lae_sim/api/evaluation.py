@@ -139,14 +139,14 @@ class Evaluated:
     @property
     def init(self) -> InitCost:
         """What initialisations cost."""
-        return self.scenario.world.init_cost(self.scenario.runs, self.totals.replay.init_ns)
+        source = self.scenario.world.init_source(self.scenario.runs.times.metadata)
+        return InitCost.of(self.totals.replay.init_ns, source)
 
     def document(self, attributes: bool = False, per_sequence: bool = False) -> dict[str, Any]:
         """The scores as a JSON object, as ``lae-sim replay --json`` has them."""
         scenario, world = self.scenario, self.scenario.world
         metadata, runs = scenario.trace.metadata, scenario.runs
         path = path_of(scenario.trace) or scenario.label
-        times = runs.trace if runs.timing is None else runs.timing
         return {
             "trace": path,
             "tracker": metadata.tracker,
@@ -154,7 +154,7 @@ class Evaluated:
             "device": metadata.device,
             "strided": [path_of(trace) or "an open trace" for trace in runs.passes],
             "times_from": path if runs.timing is None else path_of(runs.timing) or "an open trace",
-            "times_note": times.metadata.timing_note,
+            "times_note": runs.times.metadata.timing_note,
             "fps": str(runs.clock.fps),
             "policy": label_of(world.policy),
             "latency": label_of(world.latency),

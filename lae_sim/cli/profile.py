@@ -29,7 +29,7 @@ examples:
   lae-sim profile --tracker nanotrack --option weights=nanotrackv3 --root ~/data/DTB70
   lae-sim profile --tracker my_package.my_module:MyTracker --option size=small --device cuda:0
   lae-sim profile --mode real-time --pre-forecaster kalman --timing jetson.parquet
-  lae-sim profile --closed-loop constant:47ms constant:100ms --stride 3/2 2 3  then lae-sim fidelity
+  lae-sim profile --closed-loop constant:47ms,init=1s --stride 3/2 2 3         then lae-sim fidelity
 
 trackers:
   dcf                     a correlation filter, no weights needed
@@ -119,7 +119,8 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--timing",
         metavar="TRACE|constant:47ms",
-        help="real-time: the schedule follows these times instead of the measured ones",
+        help="real-time: the schedule follows these times instead of the measured ones; ,init=800ms "
+        "at the end says what the initialisation takes",
     )
     add(
         "--stride",

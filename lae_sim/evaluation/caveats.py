@@ -9,7 +9,7 @@ import numpy as np
 from lae_sim.evaluation.evaluate import ReplayStatistics, ScoredRun
 from lae_sim.evaluation.metrics import Convention
 from lae_sim.forecast.base import AnyFactory, notes_of
-from lae_sim.trace.describe import STALL
+from lae_sim.trace.describe import STALL, in_ms
 from lae_sim.trace.metadata import Metadata
 
 TRUSTED_DISAGREEMENT = 0.05
@@ -78,9 +78,9 @@ def notes_on(
         )
     if left := left_search(replay):
         notes.append(
-            f"the first frame after initialisation comes so late in {len(left)} of "
-            f"{len(sequences)} sequences that the target has left the region which a tracker such "
-            f"as SiamFC searches around the initial box: {', '.join(left)}"
+            f"initialisation ({in_ms(replay.init_ns.mean() / 1e6)}) ends so late in {len(left)} of "
+            f"{len(sequences)} sequences that by the next frame the target has left the region "
+            f"which a tracker such as SiamFC searches around the initial box: {', '.join(left)}"
         )
     unknown = sum(metadata.image_size(name) is None for name in sequences)
     if unknown and "kalman-lae-pvt" in forecasters:

@@ -223,6 +223,11 @@ class Runs:
         if self.passes and len(set(strides)) != len(strides):
             raise LaeError("two of the passes have the same stride: give each stride once")
 
+    @property
+    def times(self) -> Trace:
+        """The trace that the times are taken from."""
+        return self.trace if self.timing is None else self.timing
+
     def __iter__(self) -> Iterator[Run]:
         frames = _GROUP_FRAMES if self.batch else 1
         for jobs in batched(_jobs(self.trace, self.timing, self.passes), frames):

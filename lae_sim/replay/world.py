@@ -13,7 +13,6 @@ from fractions import Fraction
 from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
-from lae_sim._arrays import Ints
 from lae_sim.engine import policies
 from lae_sim.engine.clock import Clock, Number, exact, parse_fps, split_init, whole
 from lae_sim.engine.scheduler import Policy, scores_latency
@@ -31,8 +30,9 @@ from lae_sim.replay.latency import (
     time_label,
 )
 from lae_sim.replay.run import Runs
-from lae_sim.trace.describe import AS_A_FRAME, ASSUMED, InitCost
+from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
 from lae_sim.trace.file import Trace, read_trace
+from lae_sim.trace.metadata import Metadata
 
 SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
 """The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames.
@@ -242,23 +242,22 @@ class World:
         """What kind of times these are, such as ``"recorded"`` or ``"constant"``."""
         return kind_of(label_of(self.latency))
 
-    def init_cost(self, runs: Runs, init_ns: Ints) -> InitCost:
-        """What initialisations cost, and how one knows.
+    def init_source(self, times: Metadata) -> str:
+        """How one knows what initialisations cost (see :class:`.describe.InitCost`).
 
         Args:
-            runs: of this world.
-            init_ns: the times of their initialisations, ns, int64 [S].
+            times: of the trace that the times are taken from.
         """
-        source, times = self.source(), runs.timing or runs.trace
+        source = self.source()
         if isinstance(source, (Initialised, RandomSource)) and source.init_ns is not None:
             found = f"{ASSUMED}{source.init_ns / 1e6:g} ms"
         elif isinstance(source, Constant):
             found = AS_A_FRAME
         elif isinstance(source, RandomSource) or source in (sources.by_frame, sources.by_call):
-            found = times.metadata.init_source
+            found = times.init_source
         else:
             found = f"given by {label_of(self.latency)}"
-        return InitCost.of(init_ns, found if self.scale == 1 else f"{found} x {self.scale}")
+        return found if self.scale == 1 else f"{found} x {self.scale}"
 
     def replay(
         self, trace: TraceLike, sequences: str | Iterable[str] | None = None, batch: bool = False

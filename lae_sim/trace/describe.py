@@ -58,10 +58,10 @@ class InitCost:
 
     def __str__(self) -> str:
         """A sentence."""
-        mean, least, most = map(_short, (self.mean_ms, self.min_ms, self.max_ms))
-        cost = f"initialisation costs {mean} ms"
+        mean, least, most = map(in_ms, (self.mean_ms, self.min_ms, self.max_ms))
+        cost = f"initialisation costs {mean}"
         if least != most:
-            cost += f" on average ({least} to {most} ms)"
+            cost += f" on average ({least} to {most})"
         if self.source.startswith(AS_A_FRAME):
             return f"{cost}, the same as a frame: an assumption; name it with ,init=TIME"
         if self.source.startswith(ASSUMED):
@@ -71,8 +71,9 @@ class InitCost:
         return f"{cost}, {self.source}"
 
 
-def _short(ms: float) -> str:
-    return f"{ms:,.0f}" if ms >= 1000 else f"{ms:.3g}"
+def in_ms(ms: float) -> str:
+    """A time in words, to three digits or to the millisecond."""
+    return f"{ms:,.0f} ms" if ms >= 1000 else f"{ms:.3g} ms"
 
 
 @dataclass(frozen=True, eq=False)
