@@ -119,8 +119,8 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--timing",
         metavar="TRACE|constant:47ms",
-        help="real-time: the schedule follows these times instead of the measured ones; ,init=800ms "
-        "at the end says what the initialisation takes",
+        help="real-time: the schedule follows these times instead of the measured ones; "
+        ",init=800ms at their end says what the initialisation takes",
     )
     add(
         "--stride",

@@ -80,18 +80,12 @@ class GivenTimes:
     per_sequence: Mapping[str, tuple[int | None, int]]
     init_ns: int | None = None
 
-    def of(self, sequence: str, frames: int) -> Ints:
-        """The times of a sequence of ``frames`` frames, ns, int64 [frames].
+    def of(self, sequence: str, frames: int) -> int:
+        """The time of every frame of a sequence of ``frames`` frames, ns.
 
         Raises:
             LaeError: if it is not there, or is that of another number of frames.
         """
-        times = np.full(frames, self._each(sequence, frames), np.int64)
-        if self.init_ns is not None:
-            times[:1] = self.init_ns
-        return times
-
-    def _each(self, sequence: str, frames: int) -> int:
         if self.constant_ns is not None:
             return self.constant_ns
         if sequence not in self.per_sequence:

@@ -45,9 +45,9 @@ COLUMNS = {
 """Columns of the results, and their types.
 
 ``elapsed_ms`` is the mean time of the calls but the initialisation, ``init_ms`` the latter's;
-``longest_hold`` and the mismatches are in frames, ``failure_frame`` is the first whose answer does not overlap the truth
-(``world_frames`` if there is none); scores are in 0..1, NaN where the sequence leaves the mean or,
-offline, where the trace lacks boxes.
+``longest_hold`` and the mismatches are in frames, ``failure_frame`` is the first whose answer does
+not overlap the truth (``world_frames`` if there is none); scores are in 0..1, NaN where the
+sequence leaves the mean or, offline, where the trace lacks boxes.
 """
 
 

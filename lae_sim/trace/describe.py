@@ -67,7 +67,7 @@ class InitCost:
         if self.source.startswith(ASSUMED):
             return f"{cost}: an assumption"
         if self.source.startswith(TRACES_TIMES) and not self.is_measured:
-            return f"{cost}: an assumption, by {self.source}"
+            return f"{cost}: an assumption ({self.source})"
         return f"{cost}, {self.source}"
 
 

@@ -143,7 +143,7 @@ class Metadata:
         timing = self.document.get("timing", {})
         source, note = timing.get("source"), timing.get("note")
         if source is None:
-            source = "measured" if self.profiled else "of unknown origin"
+            source = "measured" if self.profiled else "whether measured, it does not say"
         if source == "measured" and note is None:
             return "measured"
         return f"{TRACES_TIMES}{source}" + ("" if note is None else f"; {note}")
