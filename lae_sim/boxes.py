@@ -62,3 +62,23 @@ def search_side(boxes: Floats) -> Floats:
     context = (w + h) / 2
     side: Floats = np.sqrt((w + context) * (h + context))
     return side
+
+
+def search_distance(searched: Floats, boxes: Floats) -> Floats:
+    """How far boxes lie from where a tracker searches for them, in units of :func:`search_side`.
+
+    A tracker of SiamFC's kind searches a square whose half side that is: at 1 lies its edge.
+
+    Args:
+        searched: the boxes where the tracker searches, float64 [n, 4].
+        boxes: where the target is, float64 [n, 4].
+
+    Returns:
+        The larger of |dx| and |dy| of the centres over the side, float64 [n]; NaN where a box is
+        NaN or the one searched at has no size.
+    """
+    offset = np.abs(centre(boxes) - centre(searched)).max(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance: Floats = offset / search_side(searched)
+    distance[~((searched[:, 2] > 0) & (searched[:, 3] > 0))] = np.nan
+    return distance

@@ -47,6 +47,7 @@ from lae_sim.report.replay import (
     search_report,
     trace_report,
 )
+from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
 
 if TYPE_CHECKING:
@@ -95,7 +96,7 @@ class Scenario:
         """
         metadata, convention = self.trace.metadata, find_convention(self.world.convention)
         stalls = SkippedStalls()
-        if self.world.latency == "recorded" and self.world.timing is None:
+        if self.world.times_kind == "recorded" and self.world.timing is None:
             observers = [*observers, stalls]
 
         def runs() -> Iterator[Run]:
@@ -141,12 +142,17 @@ class Evaluated:
     rows: SequenceRows
     notes: tuple[str, ...]
 
+    @property
+    def init(self) -> InitCost:
+        """What initialisations cost."""
+        source = self.scenario.world.init_source(self.scenario.runs.times.metadata)
+        return InitCost.of(self.totals.replay.init_ns, source)
+
     def document(self, attributes: bool = False, per_sequence: bool = False) -> dict[str, Any]:
         """The scores as a JSON object, as ``lae-sim replay --json`` has them."""
         scenario, world = self.scenario, self.scenario.world
         metadata, runs = scenario.trace.metadata, scenario.runs
         path = path_of(scenario.trace) or scenario.label
-        times = runs.trace if runs.timing is None else runs.timing
         return {
             "trace": path,
             "tracker": metadata.tracker,
@@ -155,7 +161,7 @@ class Evaluated:
             "strided": [path_of(trace) or "an open trace" for trace in runs.passes],
             "search": search_report(runs.search, world.pre_forecaster, self.totals.modelled),
             "times_from": path if runs.timing is None else path_of(runs.timing) or "an open trace",
-            "times_note": times.metadata.timing_note,
+            "times_note": runs.times.metadata.timing_note,
             "fps": str(runs.clock.fps),
             "policy": label_of(world.policy),
             "latency": label_of(world.latency),
@@ -169,6 +175,7 @@ class Evaluated:
                 list(scenario.forecasters),
                 world.sigmas,
                 world.convention,
+                self.init,
                 self.rows if per_sequence else None,
                 attributes,
             ),
@@ -303,7 +310,7 @@ class EvaluationResult:
         notes = [
             (f"{part.scenario.label}: " if several else "") + note
             for part in self.parts
-            for note in (*part.notes, *_exactness(part))
+            for note in (*part.notes, *_assumption(part), *_exactness(part))
         ]
         return list(dict.fromkeys(notes))
 
@@ -471,6 +478,10 @@ def _sequence_table(
     shape = tuple(map(len, axes))
     flat = {name: np.broadcast_to(values, shape).ravel() for name, values in columns.items()}
     return pd.DataFrame(flat, index).reset_index()
+
+
+def _assumption(part: Evaluated) -> list[str]:
+    return [] if part.init.is_measured else [str(part.init)]
 
 
 def _exactness(part: Evaluated) -> list[str]:

@@ -27,7 +27,10 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
     """
     add = _world_group(parser, sweeps)
     add(
-        "--latency", default="recorded", help="where processing times come from (default: recorded)"
+        "--latency",
+        default="recorded",
+        help="where processing times come from (default: recorded); constant:47ms,init=800ms "
+        "tells the initialisation apart",
     )
     add(
         "--latency-scale",
@@ -81,7 +84,8 @@ def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> N
         nargs="+",
         default=["recorded"],
         metavar="SOURCE",
-        help="processing times, one after another: recorded, constant:47ms, ... as in replay",
+        help="processing times, one after another: recorded, constant:47ms,init=800ms, ... as in "
+        "replay",
     )
     add(
         "--latency-scale",

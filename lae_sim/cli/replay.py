@@ -48,7 +48,8 @@ policies:     latest, fifo, every:N, shrinking-tail:TIME (expected processing ti
               vot-realtime[:GRACE] (the VOT toolkit's rule: it skips frames, never scores latency)
               or your own, package.module:object
 latencies:    recorded, by-call, constant:TIME, resample:SEED, lognormal:SEED,
-              bootstrap:SEED[:BLOCK], or your own, package.module:object
+              bootstrap:SEED[:BLOCK], or your own, package.module:object; each may end in
+              ,init=TIME, what the initialisation takes: constant:47ms,init=800ms
 conventions:  pysot, elae, otb, got10k, got10k-101, exclude
 """
 

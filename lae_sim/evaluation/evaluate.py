@@ -12,6 +12,7 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim.boxes import search_distance
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention
 from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_scores
@@ -45,6 +46,9 @@ class ReplayStatistics:
         departures: see :class:`lae_sim.replay.run.Run`, int64 [S].
         disagreement: see :class:`lae_sim.replay.run.Run`, float64 [S].
         init_ns: time of the initialisation, int64 [S].
+        left_search: whether the first frame after the initialisation comes so late that the target
+            has left the region which a tracker would search around the initial box (see
+            :func:`lae_sim.boxes.search_distance`), bool [S].
         calls_ns: total time of the other calls, int64 [S].
         calls_hz: sum of 1/elapsed over the other calls, per second, [S]; infinite if one took 0.
     """
@@ -58,6 +62,7 @@ class ReplayStatistics:
     departures: Ints
     disagreement: Floats
     init_ns: Ints
+    left_search: Bools
     calls_ns: Ints
     calls_hz: Floats
 
@@ -432,9 +437,22 @@ def _replay_statistics(
         departures=np.array([run.departures for run in runs], np.int64),
         disagreement=np.array([run.disagreement for run in runs]),
         init_ns=np.array([each[0] for each in elapsed], np.int64),
+        left_search=_left_search(runs),
         calls_ns=np.array([each[1:].sum() for each in elapsed], np.int64),
         calls_hz=np.array([_rates(each[1:]).sum() for each in elapsed]),
     )
+
+
+def _left_search(runs: Sequence[Run]) -> Bools:
+    """Whether the target leaves the search region during each initialisation, bool [S]."""
+    # of a run that processes nothing more, and of one that skips nothing, frame 0: no distance
+    resumed = [int(run.schedule.frames[1:2].sum()) for run in runs]
+    truth = [
+        run.recording.truth[[0, frame if frame > 1 else 0]] for run, frame in zip(runs, resumed)
+    ]
+    initial, then = np.array(truth).transpose(1, 0, 2)
+    left: Bools = search_distance(initial, then) >= 1
+    return left
 
 
 def _rates(elapsed_ns: Ints) -> Floats:

@@ -269,6 +269,11 @@ class Runs:
         """The passes at other strides."""
         return split_passes(self.passes)[0]
 
+    @property
+    def times(self) -> Trace:
+        """The trace that the times are taken from."""
+        return self.trace if self.timing is None else self.timing
+
     def __iter__(self) -> Iterator[Run]:
         frames = _GROUP_FRAMES if self.batch else 1
         for jobs in batched(_jobs(self.trace, self.timing, self.strided, self.search), frames):

@@ -26,7 +26,7 @@ from math import ceil, inf, log
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.boxes import iou, search_side
+from lae_sim.boxes import iou, search_distance, search_side
 from lae_sim.errors import LaeError
 from lae_sim.forecast.base import AnyFactory, Forecaster, ImageSize, factory_for
 from lae_sim.replay.reach import (
@@ -333,10 +333,8 @@ def _outcome(recording: Recording, jump: OwnJump) -> tuple[float, int | None]:
     That is the number of frames after the jump until an answer overlaps the recorded box; None if
     none does. The truth has no say, as everywhere in the model.
     """
-    first = recording.boxes[0]
     recorded = recording.boxes.take(jump.frames, axis=0)
-    apart = recorded[0, :2] + recorded[0, 2:] / 2 - first[:2] - first[2:] / 2
-    distance = float(np.abs(apart).max() / max(search_side(first), _TINY))
+    (distance,) = search_distance(recording.boxes[:1], recorded[:1]).tolist()
     hits = np.flatnonzero(iou(jump.answers, recorded) > FOUND_IOU)
     return distance, int(jump.frames[hits[0]]) - jump.gap if len(hits) else None
 

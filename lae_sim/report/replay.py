@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections import ChainMap
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from fractions import Fraction
 from functools import partial
 from operator import itemgetter
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 
 from lae_sim.engine.clock import Clock
+from lae_sim.evaluation.caveats import left_search
 from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED
@@ -28,6 +30,7 @@ from lae_sim.report.table import (
     relative_change,
     text_of_records,
 )
+from lae_sim.trace.describe import InitCost
 from lae_sim.trace.metadata import Metadata
 
 Report = dict[str, Any]
@@ -39,6 +42,7 @@ def trace_report(
     forecasters: Sequence[str],
     sigmas: Sequence[Fraction],
     convention: str,
+    init: InitCost,
     per_sequence: SequenceRows | None = None,
     attributes: bool = True,
 ) -> Report:
@@ -50,6 +54,7 @@ def trace_report(
         forecasters: names; ``"hold"`` must be among them.
         sigmas: permitted latencies in frames, ascending.
         convention: the convention's name.
+        init: what initialisations cost.
         per_sequence: each sequence, if they are to be reported too.
         attributes: whether to report those attributes that the totals know.
     """
@@ -105,7 +110,8 @@ def trace_report(
         "mismatch_sum": int(staleness.mismatch_sum[zero]),
         "tracker_fps": calls / calls_ns * 1e9 if calls_ns else None,
         "tracker_fps_mean": _number(float(replay.calls_hz.sum()) / calls) if calls else None,
-        "init_ms": float(np.mean(replay.init_ns)) / 1e6,
+        "init_ms": init.mean_ms,
+        "init": {**asdict(init), "left_search": left_search(replay)},
         "exact": departures == 0,
         "approximate_outputs": departures,
         "approximate_share": replay.approximate_share,
@@ -219,8 +225,11 @@ class SequenceRows:
             part.staleness.mismatch_sum[:, s].tolist(),
             replay.departures.tolist(),
             replay.disagreement.tolist(),
+            (replay.init_ns / 1e6).tolist(),
         )
-        for i, (name, frames, processed, mismatch, departures, disagreement) in enumerate(columns):
+        for i, (name, frames, processed, mismatch, departures, disagreement, init_ms) in enumerate(
+            columns
+        ):
             shares = {}
             for metric in RECOVERED:
                 won = scores[metric][i] - hold[metric][i]
@@ -233,6 +242,7 @@ class SequenceRows:
                 "sequence": name,
                 "world_frames": frames,
                 "processed": processed,
+                "init_ms": init_ms,
                 "mismatch_sum": mismatch,
                 "approximate_outputs": departures,
                 "disagreement": _number(disagreement),
@@ -370,12 +380,13 @@ def settings_text(report: Report) -> str:
             f", times from {report['times_from']}"
             if report["times_from"] != report["trace"]
             else ""
-        )
-        + f" (initialisation {report['init_ms']:.1f} ms on average)",
+        ),
     ]
     if report["times_note"] is not None:
         lines.append(f"  times: {report['times_note']}")
-    lines += [f"  {note}" for note in report["notes"]]
+    cost = {key: value for key, value in report["init"].items() if key != "left_search"}
+    lines.append(f"  {InitCost(**cost)}")
+    lines += [_wrapped(note) for note in report["notes"]]
     share = f"{report['approximate_outputs']:,} outputs ({100 * report['approximate_share']:.3g}%)"
     if report["search"] is not None:
         lines += _search_text(report["search"])
@@ -416,6 +427,13 @@ def _search_text(search: Report) -> list[str]:
     return lines
 
 
+def _wrapped(note: str) -> str:
+    """A note that may name many sequences."""
+    if len(note) < 180:
+        return f"  {note}"
+    return fill(note, 98, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
+
+
 def attribute_table(
     report: Report, shown_sigmas: Sequence[float], swept: Sequence[str] = ()
 ) -> str:
@@ -445,6 +463,7 @@ def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequenc
         Column("offline", "offline_dp20", _SCORE),
         Column("frames", "world_frames"),
         Column("processed", "processed"),
+        Column("init", "init_ms", Number(".1f", unit=" ms")),
         Column("mismatch", lambda line: line["mismatch_sum"] / line["world_frames"], _FRAMES),
         Column("modelled AUC", partial(_modelled_of, "auc"), _SCORE),
         Column("[low, high]", partial(_interval_of, "auc")),

@@ -102,6 +102,15 @@ class StudyResults:
         html: str = table[shown].to_html(index=False, float_format="{:.4f}".format, na_rep="-")
         return html
 
+    def init_sources(self) -> list[str]:
+        """How one knows what initialisations cost, for each latency."""
+        latencies: dict[str, dict[str, None]] = {}
+        for row in self.summary:
+            latencies.setdefault(row.init_source, {})[row.latency] = None
+        return [
+            f"initialisation at {', '.join(some)}: {source}" for source, some in latencies.items()
+        ]
+
     def notes(self) -> list[str]:
         """What keeps the figures from being what their names promise, each once."""
         members: dict[str, set[tuple[str, ...]]] = {}
@@ -115,7 +124,7 @@ class StudyResults:
         for source in self.plan.sources:
             if source.metadata.timing_note:
                 notes.append(f"{source.input.label}: times: {source.metadata.timing_note}")
-        notes += self.training
+        notes += [*self.init_sources(), *self.training]
         notes += [
             note for scores in self.scores for about in scores.about for note in about["notes"]
         ]
