@@ -551,6 +551,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
             if getattr(module, name, None) is function:
                 monkeypatch.setattr(module, name, counted)
     asked = [str(SLOW), "--cost", "kalman=2ms", "--sigma", "1/2", "0", "--json"]
+    asked += ["--search", "off"]
     assert replay_command.main(asked) == 0
     plain, alone = capsys.readouterr().out, calls.copy()
     # one group of sequences: a pairing for each cost, and each forecaster once
