@@ -112,7 +112,8 @@ class StudyResults:
         latencies: dict[str, dict[str, None]] = {}
         for row in self.summary:
             if not (assumed and is_measured(row.init_source)):
-                latencies.setdefault(row.init_source, {})[row.latency] = None
+                unscaled = row.init_source.removesuffix(f" x {row.scale}")
+                latencies.setdefault(unscaled, {})[row.latency] = None
         return [f"initialisation at {', '.join(some)}: {how}" for how, some in latencies.items()]
 
     def notes(self) -> list[str]:
