@@ -46,24 +46,39 @@ def centre(boxes: Floats) -> Floats:
     return boxes[:, :2] + (boxes[:, 2:] - 1.0) / 2.0
 
 
-def search_distance(searched: Floats, boxes: Floats) -> Floats:
-    """How far boxes lie from where a tracker searches for them: at 1, at the region's edge.
+def search_side(boxes: Floats) -> Floats:
+    """Side of the square that a Siamese tracker's exemplar covers, pixels: the unit of a reach.
 
-    A tracker of SiamFC's kind searches a square around its last box w x h, whose half side is
-    a = sqrt((w + p)(h + p)), p = (w + h)/2 (Bertinetto et al., "Fully-Convolutional Siamese
-    Networks for Object Tracking", 2016, Eq. 15 and twice that side).
+    ``a = sqrt((w + p)(h + p))`` with ``p = (w + h) / 2`` (Bertinetto et al., "Fully-Convolutional
+    Siamese Networks for Object Tracking", 2016, sec. 2.2).
 
     Args:
-        searched: the last boxes, float64 [n, 4].
+        boxes: float64 [..., 4].
+
+    Returns:
+        float64 [...]; NaN where the box is.
+    """
+    w, h = boxes[..., 2], boxes[..., 3]
+    context = (w + h) / 2
+    side: Floats = np.sqrt((w + context) * (h + context))
+    return side
+
+
+def search_distance(searched: Floats, boxes: Floats) -> Floats:
+    """How far boxes lie from where a tracker searches for them, in units of :func:`search_side`.
+
+    A tracker of SiamFC's kind searches a square whose half side that is: at 1 lies its edge.
+
+    Args:
+        searched: the boxes where the tracker searches, float64 [n, 4].
         boxes: where the target is, float64 [n, 4].
 
     Returns:
-        The larger of |dx| and |dy| of the centres over a, float64 [n]; NaN where a box is NaN or
-        the last one has no size.
+        The larger of |dx| and |dy| of the centres over the side, float64 [n]; NaN where a box is
+        NaN or the one searched at has no size.
     """
     offset = np.abs(centre(boxes) - centre(searched)).max(axis=1)
-    w, h = searched[:, 2], searched[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance: Floats = offset / np.sqrt((w + (w + h) / 2) * (h + (w + h) / 2))
-    distance[~((w > 0) & (h > 0))] = np.nan
+        distance: Floats = offset / search_side(searched)
+    distance[~((searched[:, 2] > 0) & (searched[:, 3] > 0))] = np.nan
     return distance

@@ -88,7 +88,8 @@ def test_invalid_traces_are_refused_with_the_expected_words(path):
     "name",
     ["format-other", "version-2", "version-number", "fps-number", "fps-division-by-zero",
      "fps-exponent", "kind-unknown", "schedule-missing", "image-size-text", "attributes-text",
-     "tracker-text"],
+     "tracker-text", "search-text", "search-without-side", "search-side-zero", "search-side-true",
+     "search-window-number", "search-source-number"],
 )  # fmt: skip
 def test_the_schema_refuses_the_same_metadata(name):
     assert not fits_schema(TRACES / "cases" / "invalid" / f"{name}.parquet")

@@ -34,6 +34,8 @@ DOCUMENT: Document = {
     "schedule": {"kind": "every-frame"},
 }
 
+RESTARTS: Document = {**DOCUMENT, "version": "1.1", "schedule": {"kind": "restarts"}}
+
 
 def good() -> Columns:
     """Two sequences of four frames, moving right and down."""
@@ -93,6 +95,13 @@ def skipping() -> Columns:
     return columns
 
 
+def restarts(*names: str) -> Columns:
+    """Restarts that jump from row 0 to row 2 and follow for a frame."""
+    columns = skipping()
+    columns["sequence"] = [name for name in names for _ in range(4)]
+    return columns
+
+
 def no_truth() -> Columns:
     """Truth that is missing in two frames."""
     columns = good()
@@ -116,7 +125,11 @@ def write_valid(folder: Path) -> None:
     full = {
         **DOCUMENT,
         "fps": "30000/1001",
-        "tracker": {"name": "example", "settings": {"scale": 2}},
+        "tracker": {
+            "name": "example",
+            "settings": {"scale": 2},
+            "search": {"half_side": 1.25, "window": True, "source": "crops of 128 and 256 pixels"},
+        },
         "device": {"model": "board", "power_mode": "15W"},
         "timing": {"source": "measured", "clock": "perf_counter_ns", "warmup_calls": 3},
         "dataset": {"name": "example"},
@@ -128,6 +141,7 @@ def write_valid(folder: Path) -> None:
     write(folder / "full-metadata.parquet", good(), full)
     write(folder / "minor-version.parquet", good(), {**DOCUMENT, "version": "1.7"})
     write(folder / "real-time.parquet", skipping(), real_time)
+    write(folder / "restarts.parquet", restarts("a+b@c@0+2", "a@12+2"), RESTARTS)
     write(folder / "missing-truth.parquet", no_truth())
     write(folder / "no-truth-columns.parquet", without("truth_x", "truth_y", "truth_w", "truth_h"))
     write(folder / "no-score-column.parquet", without("score"))
@@ -164,6 +178,19 @@ def write_invalid(folder: Path) -> None:
     bad_document("image-size-text", "image_size", sequences={"a": {"image_size": "640x480"}})
     bad_document("attributes-text", "attributes", sequences={"a": {"attributes": "Occlusion"}})
     bad_document("tracker-text", "tracker", tracker="example")
+    for name, word, search in (
+        ("search-text", "search", "near"),
+        ("search-without-side", "half_side", {"window": True}),
+        ("search-side-zero", "half_side", {"half_side": 0}),
+        ("search-side-true", "half_side", {"half_side": True}),
+        ("search-window-number", "window", {"half_side": 1.0, "window": 1}),
+        ("search-source-number", "source", {"half_side": 1.0, "source": 127}),
+    ):
+        bad_document(name, f"tracker.{'' if word == 'search' else 'search.'}{word}",
+                     tracker={"search": search})  # fmt: skip
+    for name, restart in (("restart-without-gap", "b@3"), ("restart-gap-zero", "b@3+0")):
+        bad(name, "sequence", repr(restart), "SEQUENCE@START+GAP",
+            columns=restarts("a@0+2", restart), document=RESTARTS)  # fmt: skip
 
     bad("column-missing", "elapsed_ns", "missing", columns=without("elapsed_ns"))
     bad("truth-column-missing", "truth_w", "missing", columns=without("truth_w"))

@@ -46,9 +46,29 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
         nargs="+",
         default=[],
         metavar="TRACE",
-        help="passes on every N-th frame (lae-sim profile --stride): each sequence's boxes come "
-        "from the pass that is nearest to the frames skipped",
+        help="further passes of the tracker: on every N-th frame (lae-sim profile --stride; each "
+        "sequence's boxes come from the one nearest to the frames skipped), and gap passes "
+        "(--gaps), which say how far it reaches",
     )
+
+
+def add_search(parser: argparse.ArgumentParser) -> None:
+    """Add what the search model takes: how far the tracker reaches, and from where."""
+    add = parser.add_argument_group("the search model").add_argument
+    add(
+        "--search",
+        default="trace",
+        metavar="C",
+        help="how far the tracker finds its target: c=0.7 search sides, a range c=0.6-1.0, what "
+        "the traces know (trace, the default), or no search model (off)",
+    )
+    add(
+        "--pre-forecaster",
+        metavar="NAME",
+        help="a forecaster that says where the tracker searches, such as kalman: what it is worth "
+        "is the search model's",
+    )
+    add("--keep-size", action="store_true", help="the pre-forecaster says the centre only")
 
 
 def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> None:
@@ -202,5 +222,8 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
         scale=arguments.latency_scale,
         timing=getattr(arguments, "timing", None),
         passes=getattr(arguments, "strided", ()),
+        search=getattr(arguments, "search", "off"),
+        pre_forecaster=getattr(arguments, "pre_forecaster", None),
+        keep_size=getattr(arguments, "keep_size", False),
         **scores,
     )

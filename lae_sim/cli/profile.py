@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser, parse_box
-from lae_sim.engine.clock import parse_duration, parse_fps, parse_stride, whole
+from lae_sim.engine.clock import parse_budget, parse_duration, parse_fps, parse_stride, whole
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.plugins import key_and_value
 from lae_sim.progress import ProgressBar
@@ -29,6 +29,8 @@ examples:
   lae-sim profile --tracker nanotrack --option weights=nanotrackv3 --root ~/data/DTB70
   lae-sim profile --tracker my_package.my_module:MyTracker --option size=small --device cuda:0
   lae-sim profile --mode real-time --pre-forecaster kalman --timing jetson.parquet
+  lae-sim profile --closed-loop constant:47ms constant:100ms --stride 3/2 2 3  then lae-sim fidelity
+  lae-sim profile --gaps 10m --stride 2                how far it finds a target from where it was
   lae-sim profile --closed-loop constant:47ms,init=1s --stride 3/2 2 3         then lae-sim fidelity
 
 trackers:
@@ -140,6 +142,16 @@ def parser() -> argparse.ArgumentParser:
         help="further real-time passes under these times, for lae-sim fidelity",
     )
     add(
+        "--gaps",
+        nargs="?",
+        const=True,
+        metavar="BUDGET",
+        type=argument(parse_budget),
+        help="a further pass that measures the tracker's reach by restarts: some 1,000 over the "
+        "dataset and 63 calls a sequence, or as many as the budget, such as 10m, allows "
+        "(default: 30m)",
+    )
+    add(
         "--repeat",
         type=argument(partial(whole, least=1)),
         default=1,
@@ -168,6 +180,7 @@ def _profile(arguments: argparse.Namespace) -> int:
     import json
 
     from lae_sim.plugins import parse_options
+    from lae_sim.profile.gaps import BUDGET_NS
     from lae_sim.profile.run import ProfilePlan, run_profile
 
     options = parse_options(dict(arguments.option))
@@ -197,6 +210,7 @@ def _profile(arguments: argparse.Namespace) -> int:
         timing=arguments.timing,
         strides=tuple(arguments.stride),
         closed_loops=tuple(arguments.closed_loop),
+        gaps=BUDGET_NS if arguments.gaps is True else arguments.gaps,
         repeat=arguments.repeat,
         include_decode=arguments.include_decode,
     )
@@ -227,15 +241,18 @@ def _print_summary(traces: Sequence[PassSummary]) -> None:
     first, *others = traces
     kind = first.schedule["kind"]
     strided = [each for each in others if "stride" in each.schedule]
+    gaps = [each for each in others if each.schedule["kind"] == "restarts"]
     closed = [each for each in others if each.schedule["kind"] == "real-time" != kind]
 
     def named(option: str, passes: Sequence[PassSummary]) -> str:
         paths = " ".join(shlex.quote(each.trace) for each in passes)
         return f" {option} {paths}" if passes else ""
 
-    path, strides = shlex.quote(first.trace), named("--strided", strided)
+    path, strides = shlex.quote(first.trace), named("--strided", strided + gaps)
     print("\nnext:")
     print(f"  lae-sim replay {path}{strides}")
     if closed:
         print(f"  lae-sim fidelity {path}{strides}{named('--closed-loop', closed)}")
     print(f"  lae-sim show {path}")
+    for each in gaps:
+        print(f"  lae-sim show {shlex.quote(each.trace)} --plot reach.png")

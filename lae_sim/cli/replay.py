@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import (
     add_forecasting,
+    add_search,
     add_world,
     argument,
     exit_status,
@@ -63,6 +64,7 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add_world(made, sweeps=True)
+    add_search(made)
     scores = made.add_argument_group("forecasting and scores")
     add = scores.add_argument
     add(

@@ -1,4 +1,4 @@
-"""``lae-sim show``: what a trace says of itself, and how its processing times are distributed."""
+"""``lae-sim show``: what a trace says of itself, how its times are distributed, a reach."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ _EXAMPLES = """\
 examples:
   lae-sim show trace.parquet
   lae-sim show laptop.parquet jetson.parquet --plot times.png
+  lae-sim show trace.gaps.parquet --plot reach.png     how far the tracker finds a target again
   lae-sim show trace.parquet --json | jq '.traces[].times.calls.p99_ms'
 """
 
@@ -21,20 +22,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim show``; see ``--help``."""
     parser = new_parser(
         "lae-sim show",
-        "Say what a trace holds, and how its processing times are distributed.",
+        "Say what a trace holds, and how its processing times are distributed; of a gap pass "
+        "(lae-sim profile --gaps), what the tracker's reach is.",
         _EXAMPLES,
     )
     add = parser.add_argument
     add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add("--json", action="store_true", help="print one JSON object instead of text")
-    add("--plot", metavar="FILE", help="draw the times (.png, .svg, .pdf)")
+    add(
+        "--plot",
+        metavar="FILE",
+        help="draw the times, or of gap passes the reach (.png, .svg, .pdf)",
+    )
     arguments = parser.parse_args(argv)
     return exit_status(lambda: _show(arguments), "lae-sim show")
 
 
 def _show(arguments: argparse.Namespace) -> None:
     from lae_sim import __version__
+    from lae_sim.errors import LaeError
     from lae_sim.files import check_distinct
+    from lae_sim.report.reach import ReachReport, plot_reaches
     from lae_sim.report.trace import overview, plot_times
     from lae_sim.trace.describe import describe
     from lae_sim.trace.file import read_trace
@@ -48,12 +56,27 @@ def _show(arguments: argparse.Namespace) -> None:
 
         check_distinct([arguments.plot], paths)
         check_format(arguments.plot)
-    described = [describe(read_trace(path), path) for path in paths]
+    traces = [read_trace(path) for path in paths]
+    are_gaps = [trace.metadata.kind == "restarts" for trace in traces]
+    if arguments.plot and len(set(are_gaps)) > 1:
+        raise LaeError("a picture shows times or reaches: draw gap passes and others one by one")
+    described = [describe(trace, path) for trace, path in zip(traces, paths)]
     reports = [report for report, _ in described]
+    reaches = [ReachReport.of(trace) if gaps else None for trace, gaps in zip(traces, are_gaps)]
     if arguments.json:
         document = {"format": "lae-show", "version": "1.0", "lae_sim": __version__}
-        print(json.dumps({**document, "traces": reports}, indent=2, allow_nan=False))
+        shown = [
+            report if reach is None else {**report, "reach": reach.document()}
+            for report, reach in zip(reports, reaches)
+        ]
+        print(json.dumps({**document, "traces": shown}, indent=2, allow_nan=False))
     else:
-        print("\n\n".join(map(overview, reports)))
-    if arguments.plot:
+        texts = [
+            overview(report) + ("" if reach is None else "\n\n" + reach.text())
+            for report, reach in zip(reports, reaches)
+        ]
+        print("\n\n".join(texts))
+    if arguments.plot and all(are_gaps):
+        plot_reaches([reach for reach in reaches if reach is not None], arguments.plot)
+    elif arguments.plot:
         plot_times(described, arguments.plot)

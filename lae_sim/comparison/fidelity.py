@@ -16,6 +16,7 @@ from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.evaluation.metrics import Convention, find_convention
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import load_forecaster
+from lae_sim.replay.reach import split_passes
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import parse_policy
 from lae_sim.trace.file import Trace, read_trace
@@ -137,11 +138,14 @@ def _rows(
             "'lae-sim profile --closed-loop' or '--mode real-time' left"
         )
     names = [recording.name for recording in closed]
-    every, *passes = (read_trace(other, names) for other in replayed)
-    for trace in (every, *passes):
+    every, *others = map(read_trace, replayed)
+    passes, gaps = split_passes(others)
+    for trace in (every, *passes, *gaps):
         _check_same_tracker(closed, trace)
-        if trace.metadata.kind != "every-frame":
-            raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
+    if not all(trace.metadata.kind == "every-frame" for trace in (every, *passes)):
+        raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
+    every = every.chosen(names)
+    passes = tuple(trace.chosen(names) for trace in passes)
     schedule = closed.metadata.document["schedule"]
     policy = parse_policy(schedule.get("policy", "latest"))
 
@@ -153,7 +157,7 @@ def _rows(
     closed_runs = list(Runs(closed, clock, policy=policy))
     replays = {"every-frame": list(Runs(every, clock, policy=policy, timing=closed))}
     if passes:
-        strided = Runs(every, clock, policy=policy, timing=closed, passes=tuple(passes))
+        strided = Runs(every, clock, policy=policy, timing=closed, passes=passes)
         replays["strided"] = list(strided)
     closed_scores = scores(closed_runs)
     for kind, runs in replays.items():

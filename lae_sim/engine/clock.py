@@ -24,6 +24,8 @@ Number: TypeAlias = int | float | str | Fraction
 _DECIMAL = r"[0-9]{1,12}(?:\.[0-9]{1,12})?"
 _RATIONAL = re.compile(rf"(?:{_DECIMAL}|[0-9]{{1,12}}/[0-9]{{1,12}})\Z")
 _DURATION = re.compile(rf"({_DECIMAL})(ns|us|ms|s)\Z")
+_BUDGET = re.compile(rf"({_DECIMAL}) ?(s|min|m|h)\Z")
+_BUDGET_S = {"s": 1, "m": 60, "min": 60, "h": 3600}
 UNIT_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": NS_PER_SECOND}
 
 
@@ -94,6 +96,21 @@ def parse_duration(text: str) -> int:
     if duration.denominator != 1:
         raise LaeError(f"{text!r} is not a whole number of nanoseconds")
     return int(duration)
+
+
+def parse_budget(text: str) -> int:
+    """Read how long something may take (``"10m"``, ``"90s"``, ``"1.5h"``), in ns.
+
+    Minutes are no unit of a processing time, where ``47m`` is a slip for ``47ms``.
+
+    Raises:
+        LaeError: if the unit is missing, or it is no time at all.
+    """
+    match = _BUDGET.match(text) if isinstance(text, str) else None
+    budget = Fraction(match[1]) * _BUDGET_S[match[2]] * NS_PER_SECOND if match else Fraction(0)
+    if budget < 1:
+        raise LaeError(f"{shown(text)} is no time to spend: write it with its unit, such as 10m")
+    return int(budget)
 
 
 def split_init(text: str, path: bool = False) -> tuple[str, int | None]:

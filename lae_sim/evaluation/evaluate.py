@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
+from itertools import islice
 from typing import TypeAlias, TypeVar
 
 import numpy as np
@@ -14,8 +15,9 @@ from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import search_distance
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention
+from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_scores
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
-from lae_sim.evaluation.scoring import Scorer
+from lae_sim.evaluation.scoring import Scored, Scorer
 from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run
 from lae_sim.trace.file import Trace
@@ -132,6 +134,7 @@ class Evaluation:
         offline: per metric, of the trace's boxes at their own frames, float64 [S]; NaN where the
             trace does not hold every frame.
         offline_curves: likewise, [S, ...].
+        modelled: the same under the search model.
     """
 
     replay: ReplayStatistics
@@ -141,6 +144,7 @@ class Evaluation:
     curves: Curves
     offline: Mapping[str, Floats]
     offline_curves: Curves
+    modelled: ModelledScores
 
     @classmethod
     def joined(cls, parts: Sequence[Evaluation]) -> Evaluation:
@@ -153,6 +157,7 @@ class Evaluation:
             curves=_joined([part.curves for part in parts], axis=1),
             offline={m: np.concatenate([p.offline[m] for p in parts]) for m in METRICS},
             offline_curves=_joined([part.offline_curves for part in parts]),
+            modelled=ModelledScores.joined([part.modelled for part in parts]),
         )
 
 
@@ -333,18 +338,11 @@ class _Scoring:
     def of(self, runs: Sequence[Run], offline: Sequence[_Offline]) -> Evaluation:
         """Score some runs at once."""
         schedules = [run.schedule for run in runs]
-        costs = {name: self.costs.get(name, 0) for name in self.forecasters}
-        pairings = {
-            cost: pair(schedules, self.sigmas, cost) for cost in sorted({0, *costs.values()})
-        }
-        scorer = Scorer([run.recording for run in runs], self.convention)
+        costs = {self.costs.get(name, 0) for name in self.forecasters}
+        pairings = {cost: pair(schedules, self.sigmas, cost) for cost in sorted({0, *costs})}
         kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs]
-        scored = []
-        for name, factory in self.forecasters.items():
-            pairing = pairings[costs[name]]
-            parts = _answers(runs, self.metadata, pairing, name, factory)
-            parts = self._observed(parts, pairing, name, kept)
-            scored.append(scorer.of(parts, len(self.sigmas), self.curves_at))
+        scored = self._scored(runs, pairings, kept)
+        scores = {m: np.stack([each.scores[m] for each in scored]) for m in METRICS}
         for place, run in enumerate(runs if self.observers else ()):
             one = ScoredRun(run, kept[place], place, self.sigmas, pairings)
             for observer in self.observers:
@@ -354,7 +352,7 @@ class _Scoring:
             staleness=Staleness(
                 pairings[0].mismatch_sum, pairings[0].mismatch_max, pairings[0].longest_hold
             ),
-            scores={m: np.stack([each.scores[m] for each in scored]) for m in METRICS},
+            scores=scores,
             failure=np.stack([each.failure for each in scored]),
             curves=Curves(
                 np.stack([each.success for each in scored]),
@@ -365,7 +363,49 @@ class _Scoring:
                 np.stack([each.success for each in offline]),
                 np.stack([each.precision for each in offline]),
             ),
+            modelled=self._modelled(runs, scores),
         )
+
+    def _scored(
+        self,
+        runs: Sequence[Run],
+        pairings: Mapping[int, Pairing],
+        kept: Sequence[dict[tuple[str, Fraction], Answers]],
+    ) -> list[Scored]:
+        """The scores of each forecaster."""
+        scorer = Scorer([run.recording for run in runs], self.convention)
+        scored = []
+        for name, factory in self.forecasters.items():
+            pairing = pairings[self.costs.get(name, 0)]
+            parts = _answers(runs, self.metadata, pairing, name, factory)
+            parts = self._observed(parts, pairing, name, kept)
+            scored.append(scorer.of(parts, len(self.sigmas), self.curves_at))
+        return scored
+
+    def _modelled(self, runs: Sequence[Run], recorded: Mapping[str, Floats]) -> ModelledScores:
+        """The scores under the search model; its outcomes are scored as runs are."""
+        scores: list[dict[str, Floats]] = []
+        others = []
+        for s, run in enumerate(runs):
+            boxes = () if run.modelled is None else run.modelled.boxes
+            scores.append(
+                {m: np.stack([recorded[m][:, s]] * len(boxes), 1) for m in MODELLED}
+                if boxes
+                else {}
+            )
+            for r, each in enumerate(boxes):
+                if not np.array_equal(each, run.boxes):
+                    others.append((s, r, replace(run, boxes=each)))
+        costs = {self.costs.get(name, 0) for name in self.forecasters}
+        unobserved, places = replace(self, observed=()), iter(others)
+        for group in batched([run for *_, run in others]):
+            schedules = [run.schedule for run in group]
+            pairings = {cost: pair(schedules, self.sigmas, cost) for cost in costs}
+            scored = unobserved._scored(group, pairings, [])
+            for i, (s, r, _) in enumerate(islice(places, len(group))):
+                for metric in MODELLED:
+                    scores[s][metric][:, r] = [each.scores[metric][i] for each in scored]
+        return modelled_scores(runs, recorded, scores)
 
     def _observed(
         self,

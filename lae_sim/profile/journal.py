@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -67,15 +68,33 @@ class Journal:
             except LaeError:  # it is run again
                 part.unlink()
 
+    def decided(self, name: str, decide: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+        """What was decided under a name before, or is now and will be when it is resumed.
+
+        Args:
+            name: of a file.
+            decide: makes a JSON object.
+        """
+        path = self._folder / f"{name}.json"
+        with suppress(OSError, ValueError):
+            return dict(json.loads(path.read_text()))
+        decision = decide()
+        with written_whole(path) as temporary:
+            temporary.write_text(json.dumps(decision))
+        return dict(decision)
+
     def finished(self, name: str) -> list[str]:
         """The finished sequences of a pass, sorted."""
         return sorted(unquote(path.stem) for path in (self._folder / name).glob("[!.]*.parquet"))
 
-    def add(self, name: str, recording: Recording, metadata: Metadata) -> None:
-        """Keep a finished sequence of a pass."""
+    def add(
+        self, name: str, sequence: str, recordings: Sequence[Recording], metadata: Metadata
+    ) -> None:
+        """Keep a finished sequence of a pass: one recording, or those of its restarts."""
         folder = self._folder / name
         _made(folder)
-        write_trace(Trace(metadata, [recording]), folder / _file_name(recording.name))
+        in_order = sorted(recordings, key=lambda recording: recording.name)
+        write_trace(Trace(metadata, in_order), folder / _file_name(sequence))
 
     def metadata(self, name: str) -> list[Metadata]:
         """What was kept with each finished sequence of a pass."""
@@ -85,7 +104,7 @@ class Journal:
         ]
 
     def recordings(self, name: str) -> Iterator[Recording]:
-        """The finished sequences of a pass, sorted by name."""
+        """The recordings of a pass, sequence by sequence, sorted by name."""
         for sequence in self.finished(name):
             yield from read_trace(self._folder / name / _file_name(sequence))
 

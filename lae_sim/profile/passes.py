@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,8 @@ from lae_sim.profile.live import Live, LiveRun
 from lae_sim.profile.timed import TimedTracker, TrackerError
 from lae_sim.replay.latency import by_frame, initialised
 from lae_sim.trace.file import Trace, read_trace, write_trace
-from lae_sim.trace.metadata import FORMAT, VERSION, Metadata
+from lae_sim.trace.metadata import FORMAT, Metadata, version_of
+from lae_sim.trace.recording import Recording
 
 READING_INTERVAL_S = 10.0
 
@@ -74,15 +75,22 @@ class Pass:
         name: of its part of the journal.
         path: where its trace goes.
         metadata: of the trace, but for what is known only after the sequences.
-        run: ``run(sequence, progress=progress)`` runs the tracker through a sequence.
-        rounds: how often it goes through each sequence.
+        run: ``run(sequence, progress=progress)`` runs the tracker through a sequence, in one run or
+            in several restarts, of which some may fail.
+        work: how many world frames ``run`` tells ``progress`` of.
+        ahead: whether frames are decoded ahead of the measurement, a block at a time.
+        prepare: called with the journal before the first sequence.
+        schedule: further keys of the metadata's schedule, made from the names of what was run.
     """
 
     name: str
     path: Path
     metadata: Metadata
-    run: Callable[..., LiveRun]
-    rounds: int = 1
+    run: Callable[..., Sequence[LiveRun | Failure]]
+    work: Callable[[ImageSequence], int] = len
+    ahead: bool = True
+    prepare: Callable[[Journal], object] = lambda journal: None
+    schedule: Callable[[Collection[str]], Mapping[str, Any]] = lambda names: {}
 
 
 def parse_timing(text: str) -> tuple[str, Timing]:
@@ -150,7 +158,6 @@ def base_document(
     measured = {k: described.pop(k) for k in ("synchronised", "threads") if k in described}
     return {
         "format": FORMAT,
-        "version": VERSION,
         "fps": str(clock.fps),
         "tracker": {"name": name, **described},
         "device": {**describe_device(), "readings": {"before": readings()}},
@@ -175,8 +182,14 @@ def scheduled(document: Mapping[str, Any], source: str = "measured", **schedule:
         schedule: keys of the metadata's schedule, ``kind`` among them.
     """
     timing = {"source": source, **document["timing"]}
+    version = version_of(schedule["kind"])
     return Metadata.of(
-        {**document, "timing": timing, "schedule": {**schedule, **document["schedule"]}}
+        {
+            **document,
+            "version": version,
+            "timing": timing,
+            "schedule": {**schedule, **document["schedule"]},
+        }
     )
 
 
@@ -187,7 +200,6 @@ def run_pass(
     journal: Journal,
     warmup: int,
     progress: Progress,
-    buffered: bool = True,
 ) -> list[Failure]:
     """Run the sequences that the journal lacks, and put each into it.
 
@@ -198,7 +210,6 @@ def run_pass(
         journal: where finished sequences are kept.
         warmup: calls before the first sequence, and after each failure of the tracker.
         progress: told of world frames done.
-        buffered: whether frames are decoded ahead of the measurement.
 
     Returns:
         What failed.
@@ -210,7 +221,7 @@ def run_pass(
     finished = set(journal.finished(task.name))
     cold, read_at = True, -math.inf
     for order, sequence in enumerate(dataset.sequences):
-        left = len(sequence) * task.rounds
+        left = task.work(sequence)
 
         def advance(frames: int) -> None:
             nonlocal left
@@ -225,17 +236,23 @@ def run_pass(
             if cold:
                 warm_up(tracker, ready, warmup)
                 cold = False
-            run = task.run(ready if buffered else sequence, progress=advance)
+            made = task.run(ready if task.ahead else sequence, progress=advance)
         except LaeError as error:
             failures.append(Failure(sequence.name, str(error)))
             cold = cold or isinstance(error, TrackerError)
         else:
+            failed = [each for each in made if isinstance(each, Failure)]
+            failures += failed
+            runs = [each for each in made if isinstance(each, LiveRun)]
+            if not runs:
+                advance(left)
+                continue
             during = []
             if time.monotonic() - read_at > READING_INTERVAL_S:
                 during = [{"sequence": sequence.name, **readings()}]
                 read_at = time.monotonic()
-            metadata = _of_sequence(task.metadata, sequence, run, order, during)
-            journal.add(task.name, run.recording, metadata)
+            metadata = _of_sequence(task.metadata, sequence, runs, order, during, failed)
+            journal.add(task.name, sequence.name, [run.recording for run in runs], metadata)
         advance(left)
     return failures
 
@@ -259,13 +276,18 @@ def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> boo
     device = dict(document["device"])
     device["readings"] = {"before": before, "during": during, "after": readings()}
     document["device"] = device
-    if failures:
-        document["failures"] = [asdict(failure) for failure in failures]
+    document["schedule"] = {**document["schedule"], **task.schedule(document["sequences"])}
+    failed = [*(each for d in kept for each in d.get("failures", ())), *map(asdict, failures)]
+    if failed:
+        document["failures"] = list({each["sequence"]: each for each in failed}.values())
     entries = document["sequences"].values()
     measured = sum(entry["measured_ns"] for entry in entries)
     cpu = sum(entry["cpu_ns"] for entry in entries)
     document["timing"] = {**document["timing"], "cpu_share": round(cpu / max(measured, 1), 3)}
-    write_trace(Trace(Metadata.of(document), journal.recordings(task.name)), task.path)
+    recordings: Iterable[Recording] = journal.recordings(task.name)
+    if task.metadata.kind == "restarts":  # "a b" before "a", but "a@1+3" before "a b@1+3"
+        recordings = sorted(recordings, key=lambda recording: recording.name)
+    write_trace(Trace(Metadata.of(document), recordings), task.path)
     return True
 
 
@@ -305,22 +327,28 @@ def warm_up(tracker: TimedTracker, sequence: ImageSequence, calls: int) -> None:
 def _of_sequence(
     metadata: Metadata,
     sequence: ImageSequence,
-    run: LiveRun,
+    runs: Sequence[LiveRun],
     order: int,
     during: list[dict[str, Any]],
+    failures: Sequence[Failure],
 ) -> Metadata:
     """The metadata of a pass for one finished sequence."""
     document = dict(metadata.document)
+    # of many restarts they would be most of the file
+    attributes = () if metadata.kind == "restarts" else sequence.attributes
     document["sequences"] = {
-        sequence.name: {
+        run.recording.name: {
             "image_size": list(run.image_size),
-            **({"attributes": list(sequence.attributes)} if sequence.attributes else {}),
+            **({"attributes": list(attributes)} if attributes else {}),
             "order": order,
             "lost": len(run.lost),
             "measured_ns": int(run.measured_ns.sum()),
             "cpu_ns": run.cpu_ns,
         }
+        for run in runs
     }
+    if failures:
+        document["failures"] = [asdict(failure) for failure in failures]
     device = dict(document["device"])
     device["readings"] = {**device["readings"], "during": during}
     document["device"] = device

@@ -19,6 +19,7 @@ from lae_sim.datasets.layouts import find_dataset
 from lae_sim.engine.clock import (
     NS_PER_SECOND,
     Clock,
+    parse_budget,
     parse_duration,
     parse_fps,
     parse_stride,
@@ -29,6 +30,7 @@ from lae_sim.files import check_distinct, check_folders, sequence_names
 from lae_sim.forecast.camera import Camera
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import load_forecaster
+from lae_sim.profile.gaps import BUDGET_NS, Gaps
 from lae_sim.profile.journal import Journal
 from lae_sim.profile.live import LiveRun, run_every_frame, run_real_time
 from lae_sim.profile.passes import (
@@ -58,6 +60,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 MODES = ("every-frame", "real-time")
+_FAILURES = 20  # of a pass that are told one by one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +89,9 @@ class ProfilePlan:
             :func:`lae_sim.profile.passes.parse_timing`). Real-time only.
         strides: further passes on every N-th frame, each above 1.
         closed_loops: further real-time passes under these times, as of ``timing``.
+        gaps: what a further pass may take that measures the tracker's reach by restarts (see
+            :mod:`lae_sim.profile.gaps`), ns; None for no such pass. :meth:`of` takes text, and True
+            for half an hour.
         repeat: how often the first pass is run.
         include_decode: whether times include the decoding of frames.
 
@@ -114,6 +120,7 @@ class ProfilePlan:
     timing: str | None = None
     strides: Sequence[Fraction] = ()
     closed_loops: Sequence[str] = ()
+    gaps: int | None = None
     repeat: int = 1
     include_decode: bool = False
 
@@ -122,8 +129,8 @@ class ProfilePlan:
             raise LaeError(f"mode: no {self.mode!r}: there are {' and '.join(MODES)}")
         if not self.real_time and (self.policy or self.timing):
             raise LaeError("policy and timing are for mode real-time")
-        if self.real_time and (self.strides or self.closed_loops):
-            raise LaeError("strides and closed loops go with mode every-frame")
+        if self.real_time and (self.strides or self.closed_loops or self.gaps):
+            raise LaeError("strides, gaps and closed loops go with mode every-frame")
         if (self.translate or self.keep_size) and self.pre_forecaster is None:
             raise LaeError("translate and keep_size are ways to use a pre_forecaster")
 
@@ -290,29 +297,24 @@ def run_profile(
     with closing(_start(plan, notice)) as started:
         with suppress(LaeError):  # a tracker may import libraries, or reach the GPU, only now
             warm_up(started, dataset.sequences[0], min(plan.warmup, 1))
-        passes = _passes(plan, dataset, started, path)
+        passes = _passes(plan, dataset, started, path, notice)
         described = {f"tracker's {key}": value for key, value in started.describe().items()}
         settled = {"lae_sim": __version__, **plan.settings(), **described}
         journal = Journal(unfinished, settled, resume)
-        total = sum(map(len, dataset.sequences)) * sum(task.rounds for task in passes)
-        done = 0
+        total = done = 0
 
         def advance(frames: int) -> None:
             nonlocal done
             done += frames
             progress(done, total)
 
-        advance(0)
         try:
             for task in passes:
+                task.prepare(journal)
+                total = sum(each.work(s) for each in passes for s in dataset.sequences)
+                advance(0)
                 failures[task.name] = run_pass(
-                    task,
-                    dataset,
-                    started,
-                    journal,
-                    plan.warmup,
-                    advance,
-                    buffered=not plan.include_decode,
+                    task, dataset, started, journal, plan.warmup, advance
                 )
         except KeyboardInterrupt:
             interrupted = True
@@ -320,8 +322,11 @@ def run_profile(
     if not interrupted:
         journal.remove()
     failed = tuple(failure for each in failures.values() for failure in each)
-    for failure in failed:
-        notice(f"failed: {failure.reason}")
+    for each in failures.values():
+        for failure in each[:_FAILURES]:
+            notice(f"failed: {failure.reason}")
+        if len(each) > _FAILURES:
+            notice(f"failed: and {len(each) - _FAILURES:,} more")
     if interrupted:
         kept = f"{path} holds what is complete; " if written else ""
         notice(f"{kept}--resume goes on")
@@ -377,6 +382,13 @@ def _timing(value: Any) -> str:
     return _path(value)
 
 
+def _gaps(value: Any) -> int | None:
+    """A budget; True is the usual one, False none."""
+    if isinstance(value, bool):
+        return BUDGET_NS if value else None
+    return parse_budget(value)
+
+
 def _each(parse: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, ...]]:
     return lambda value: tuple(map(parse, several(value)))
 
@@ -404,6 +416,7 @@ _PARSERS: Mapping[str, Callable[[Any], Any]] = {
     "timing": _timing,
     "strides": _each(parse_stride),
     "closed_loops": _each(_timing),
+    "gaps": _gaps,
     "repeat": partial(whole, least=1),
     "include_decode": flag,
 }
@@ -428,8 +441,14 @@ def _start(plan: ProfilePlan, notice: Callable[[str], object]) -> TimedTracker:
     return Translated(tracker) if plan.translate or needed else tracker
 
 
-def _passes(plan: ProfilePlan, dataset: Dataset, tracker: TimedTracker, out: Path) -> list[Pass]:
-    """The first pass and its repetitions, the strided ones and the closed loops."""
+def _passes(
+    plan: ProfilePlan,
+    dataset: Dataset,
+    tracker: TimedTracker,
+    out: Path,
+    notice: Callable[[str], object],
+) -> list[Pass]:
+    """The first pass and its repetitions, the strided ones, the gap pass and the closed loops."""
     clock = Clock.at(dataset.fps)
     policy_name = plan.policy or "latest"
     policy = parse_policy(policy_name)
@@ -450,9 +469,18 @@ def _passes(plan: ProfilePlan, dataset: Dataset, tracker: TimedTracker, out: Pat
             "keep_size": plan.keep_size,
         }
 
+    def path_of(name: str) -> Path:
+        return out.with_suffix(f".{name}.parquet") if name else out
+
     def new_pass(name: str, run: Callable[..., LiveRun], rounds: int = 1, **schedule: Any) -> Pass:
-        path = out.with_suffix(f".{name}.parquet") if name else out
-        return Pass(name or "first", path, scheduled(document, **schedule), run, rounds)
+        return Pass(
+            name or "first",
+            path_of(name),
+            scheduled(document, **schedule),
+            lambda sequence, progress: [run(sequence, progress=progress)],
+            work=lambda sequence: rounds * len(sequence),
+            ahead=not plan.include_decode,
+        )
 
     def real_time(name: str, timing: str | None) -> Pass:
         source, times = parse_timing(timing) if timing else ("measured", None)
@@ -477,9 +505,25 @@ def _passes(plan: ProfilePlan, dataset: Dataset, tracker: TimedTracker, out: Pat
             stride=str(stride),
         )
 
+    def gap_pass(budget_ns: int) -> Pass:
+        metadata = scheduled(document, kind="restarts")
+        half_side = metadata.search.half_side if metadata.search else None
+        gaps = Gaps(dataset, live, budget_ns, half_side, notice)
+        return Pass(
+            "gaps",
+            path_of("gaps"),
+            metadata,
+            gaps.run,
+            work=gaps.calls,
+            ahead=False,
+            prepare=gaps.prepare,
+            schedule=gaps.schedule,
+        )
+
     names = ["", *(f"repeat{n}" for n in range(2, plan.repeat + 1))]
     passes = [real_time(n, plan.timing) if plan.real_time else every_frame(n) for n in names]
     passes += [strided(stride) for stride in dict.fromkeys(plan.strides)]
+    passes += [] if plan.gaps is None else [gap_pass(plan.gaps)]
     passes += [
         real_time(f"closed-loop-{_short(timing)}", timing)
         for timing in dict.fromkeys(plan.closed_loops)

@@ -10,6 +10,7 @@ from .latency import (
     resampled,
     scaled,
 )
+from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
 from .run import Run, Runs, replay_repeated, replay_sequence
 from .strides import followed, phases
 from .world import (
@@ -25,7 +26,10 @@ from .world import (
 __all__ = [
     "SIGMA_GRID",
     "LatencySource",
+    "OwnJump",
     "RandomSource",
+    "Reach",
+    "Restart",
     "Run",
     "Runs",
     "TraceLike",
@@ -34,9 +38,11 @@ __all__ = [
     "by_call",
     "by_frame",
     "constant",
+    "fit_reach",
     "followed",
     "initialised",
     "lognormal",
+    "own_jumps",
     "parse_latency",
     "parse_policy",
     "parse_sigmas",
@@ -45,5 +51,6 @@ __all__ = [
     "replay_sequence",
     "replay_trace",
     "resampled",
+    "restarts_of",
     "scaled",
 ]

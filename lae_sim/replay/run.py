@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 
@@ -17,7 +17,10 @@ from lae_sim.engine.policies import latest
 from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
 from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError, explained, shown
+from lae_sim.forecast.base import ImageSize
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
+from lae_sim.replay.reach import split_passes
+from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
 from lae_sim.trace.recording import Recording, batched
@@ -41,6 +44,7 @@ class Run:
         disagreement: share of processed frames where the box of the next lower or next higher
             stride overlaps less than half, 0 if the replay is exact, NaN without strided passes.
             Where it is high the tracker's luck depends on the frames that it sees.
+        modelled: what the search model makes of the run; None where it is off, or the replay exact.
 
     Example:
         >>> import lae_sim
@@ -57,6 +61,7 @@ class Run:
     boxes: Floats
     departures: int
     disagreement: float = np.nan
+    modelled: Outcomes | None = None
 
     def __len__(self) -> int:
         """Number of world frames T."""
@@ -75,6 +80,8 @@ def replay_sequence(
     times: Recording | None = None,
     stride: Fraction = Fraction(1),
     strided: Mapping[Fraction, Recording] | None = None,
+    search: SearchModel | None = None,
+    image_size: ImageSize = None,
 ) -> Run:
     """Replay a recording under a latency source and a policy.
 
@@ -87,6 +94,8 @@ def replay_sequence(
         stride: that of the recording, if it holds every frame (see :mod:`lae_sim.replay.strides`).
         strided: recordings of every frame at other strides. The boxes are taken from the pass whose
             stride is nearest to the mean number of frames from one output to the next.
+        search: the model of where the tracker finds its target; None for none.
+        image_size: width and height in pixels, if known, for the model's pre-forecaster.
 
     Raises:
         LaeError: if a frame is asked for that the recording lacks, or the recordings differ in
@@ -104,7 +113,8 @@ def replay_sequence(
         raise LaeError(f"recording: one sequence, such as trace['car'], not {shown(recording)}")
     if not isinstance(clock, Clock):
         raise LaeError(f"clock: such as Clock.at(trace.metadata.fps), not {shown(clock)}")
-    job = _Job(recording, recording if times is None else times, strided or {}, stride)
+    times = recording if times is None else times
+    job = _Job(recording, times, strided or {}, stride, search, image_size)
     return job.run(simulate(len(recording), clock, source(job.times), policy))
 
 
@@ -116,6 +126,8 @@ class _Job:
     times: Recording
     passes: Mapping[Fraction, Recording]
     stride: Fraction
+    search: SearchModel | None = None
+    image_size: ImageSize = None
 
     def __post_init__(self) -> None:
         for other in (self.times, *self.passes.values()):
@@ -129,11 +141,30 @@ class _Job:
         return len(self.recording)
 
     def run(self, schedule: Schedule) -> Run:
-        recording, frames = self.recording, schedule.frames
+        frames = schedule.frames
+        passes = {self.stride: self.recording, **self.passes}
+        strides = sorted(passes)
+        nearest = _nearest(strides, frames)
+        source = passes[strides[nearest]]
+        boxes = _boxes(source, frames)
+        before = self.before if source is self.recording else _before(source, strides[nearest])
+        departures = _departures(before, frames)
+        disagreement = np.nan
         if self.passes:
-            return _from_passes(recording, {self.stride: recording, **self.passes}, schedule)
-        departures = _departures(self.before, frames)
-        return Run(recording, schedule, _boxes(recording, frames), departures)
+            parted = np.zeros(len(frames), bool)
+            for stride in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
+                parted |= iou(_boxes(passes[stride], frames), boxes) < PARTED_IOU
+            disagreement = float(parted.mean())
+        run = Run(self.recording, schedule, boxes, departures, disagreement)
+        if self.search is None or not (departures or self.search.pre_forecaster is not None):
+            return run
+        farther = np.append(False, np.diff(frames) > (frames - before.take(frames))[1:])
+        recorded = [RecordedAnswers(boxes, farther)]
+        if self.passes:
+            for stride in _beside(strides, frames):
+                recorded += phase_answers(stride, passes[stride], frames)
+        modelled = self.search.outcomes(self.recording, frames, recorded, self.image_size)
+        return replace(run, modelled=modelled)
 
     @cached_property
     def before(self) -> Ints:
@@ -166,21 +197,22 @@ def _departures(before: Ints, frames: Ints) -> int:
     return int(np.count_nonzero(before.take(frames[1:]) != frames[:-1]))
 
 
-def _from_passes(
-    recording: Recording, passes: Mapping[Fraction, Recording], schedule: Schedule
-) -> Run:
-    """The run whose boxes come from the pass that is nearest to its mean step."""
-    frames = schedule.frames
+def _nearest(strides: Sequence[Fraction], frames: Ints) -> int:
+    """The stride nearest to the mean step of some processed frames, by its place."""
     step = Fraction(int(frames[-1]), max(len(frames) - 1, 1))
-    strides = sorted(passes)
-    nearest = min(range(len(strides)), key=lambda k: abs(strides[k] - step))
-    source = passes[strides[nearest]]
-    boxes = _boxes(source, frames)
-    departures = _departures(_before(source, strides[nearest]), frames)
-    parted = np.zeros(len(frames), bool)
-    for stride in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
-        parted |= iou(_boxes(passes[stride], frames), boxes) < PARTED_IOU
-    return Run(recording, schedule, boxes, departures, float(parted.mean()))
+    return min(range(len(strides)), key=lambda k: abs(strides[k] - step))
+
+
+def _beside(strides: Sequence[Fraction], frames: Ints) -> list[Fraction]:
+    """The strides next below and above the mean step of some processed frames.
+
+    The step from the initialisation does not count: a long one says nothing of those after it.
+    """
+    after = frames[1:] if len(frames) > 2 else frames
+    step = Fraction(int(after[-1] - after[0]), max(len(after) - 1, 1))
+    below = max((stride for stride in strides if stride <= step), default=strides[0])
+    above = min((stride for stride in strides if stride >= step), default=strides[-1])
+    return sorted({below, above})
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -193,13 +225,16 @@ class Runs:
         source: how to take processing times from a recording.
         policy: which frame is processed next.
         timing: another device's trace to take the times from; it must have the same sequences.
-        passes: traces of the same tracker at other strides (see :func:`replay_sequence`).
+        passes: further traces of the same tracker: at other strides (see
+            :func:`replay_sequence`), and gap passes.
         batch: schedule many sequences at once where source and policy allow it (see
             :func:`lae_sim.engine.lanes.batchable`). The runs are the same, and come in groups.
+        search: the model of where the tracker finds its target; None for none.
 
     Raises:
-        LaeError: if two passes have the same stride; while one goes through the runs, if a
-            sequence or frame that is asked for is not there, or policy or source raise something.
+        LaeError: if two passes have the same stride, or the trace is a gap pass; while one goes
+            through the runs, if a sequence or frame that is asked for is not there, or policy or
+            source raise something.
 
     Example:
         >>> import lae_sim
@@ -217,11 +252,22 @@ class Runs:
     timing: Trace | None = None
     passes: tuple[Trace, ...] = ()
     batch: bool = False
+    search: SearchModel | None = None
 
     def __post_init__(self) -> None:
-        strides = [trace.metadata.stride for trace in (self.trace, *self.passes)]
-        if self.passes and len(set(strides)) != len(strides):
+        if self.trace.metadata.kind == "restarts":
+            raise LaeError(
+                f"{self.trace!r} is a gap pass, which measures a tracker's reach: "
+                "give it to --strided (passes) of a trace of every frame"
+            )
+        strides = [trace.metadata.stride for trace in (self.trace, *self.strided)]
+        if self.strided and len(set(strides)) != len(strides):
             raise LaeError("two of the passes have the same stride: give each stride once")
+
+    @property
+    def strided(self) -> tuple[Trace, ...]:
+        """The passes at other strides."""
+        return split_passes(self.passes)[0]
 
     @property
     def times(self) -> Trace:
@@ -230,7 +276,7 @@ class Runs:
 
     def __iter__(self) -> Iterator[Run]:
         frames = _GROUP_FRAMES if self.batch else 1
-        for jobs in batched(_jobs(self.trace, self.timing, self.passes), frames):
+        for jobs in batched(_jobs(self.trace, self.timing, self.strided, self.search), frames):
             with explained("latency"):
                 services = [self.source(job.times) for job in jobs]
             yield from _replayed(jobs, self.clock, services, self.policy)
@@ -243,8 +289,8 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
     """Replay a trace again and again, under other random times in each repetition.
 
     Args:
-        runs: of a trace with random times, without passes; the repetition of their source does not
-            count.
+        runs: of a trace with random times, without strided passes; the repetition of their source
+            does not count.
         count: number of repetitions.
         first: the first repetition.
 
@@ -258,9 +304,9 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
             there.
     """
     source = runs.source
-    if not isinstance(source, RandomSource) or runs.passes:
+    if not isinstance(source, RandomSource) or runs.strided:
         raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
-    for jobs in batched(_jobs(runs.trace, runs.timing), _GROUP_FRAMES):
+    for jobs in batched(_jobs(runs.trace, runs.timing, (), runs.search), _GROUP_FRAMES):
         size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
         for begin in range(first, first + count, size):
             some = range(begin, min(begin + size, first + count))
@@ -284,7 +330,9 @@ def _replayed(
         yield job.run(schedule)
 
 
-def _jobs(trace: Trace, timing: Trace | None, strided: Sequence[Trace] = ()) -> Iterator[_Job]:
+def _jobs(
+    trace: Trace, timing: Trace | None, strided: Sequence[Trace], search: SearchModel | None
+) -> Iterator[_Job]:
     """Each recording of a trace with those of the same name in other traces."""
     times = None if timing is None else _finder(timing, "the trace of the times")
     passes = {
@@ -298,6 +346,8 @@ def _jobs(trace: Trace, timing: Trace | None, strided: Sequence[Trace] = ()) -> 
             recording if times is None else times(recording.name),
             {other: find(recording.name) for other, find in passes.items()},
             stride,
+            search,
+            trace.metadata.image_size(recording.name),
         )
 
 

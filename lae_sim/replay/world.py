@@ -18,6 +18,7 @@ from lae_sim.engine.clock import Clock, Number, exact, parse_fps, split_init, wh
 from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError, hint, shown
 from lae_sim.files import sequence_names
+from lae_sim.forecast.base import AnyFactory
 from lae_sim.plugins import bound, imported
 from lae_sim.replay import latency as sources
 from lae_sim.replay.latency import (
@@ -29,7 +30,9 @@ from lae_sim.replay.latency import (
     scaled,
     time_label,
 )
+from lae_sim.replay.reach import split_passes
 from lae_sim.replay.run import Runs
+from lae_sim.replay.search import find_search, parse_search
 from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
 from lae_sim.trace.file import Trace, read_trace
 from lae_sim.trace.metadata import Metadata
@@ -84,7 +87,12 @@ class World:
         scale: exact factor on all times.
         timing: another device's trace of the same sequences, to take the times from.
         passes: traces of the same tracker at other strides, one of which each sequence's boxes
-            come from (see :func:`lae_sim.replay.run.replay_sequence`).
+            come from (see :func:`lae_sim.replay.run.replay_sequence`), and gap passes.
+        search: what is assumed of how far the tracker finds its target, by name (see
+            :func:`lae_sim.replay.search.parse_search`).
+        pre_forecaster: name of the forecaster that says where the tracker searches, in the search
+            model; None where that is its last answer.
+        keep_size: whether it says the centre only.
         sigmas: permitted latencies in frames, ascending.
         convention: how frames and thresholds count, by name.
         forecasters: names.
@@ -109,6 +117,9 @@ class World:
     scale: Fraction = Fraction(1)
     timing: TraceLike | None = None
     passes: tuple[TraceLike, ...] = ()
+    search: str = "trace"
+    pre_forecaster: str | None = None
+    keep_size: bool = False
     sigmas: tuple[Fraction, ...] = (Fraction(0),)
     convention: str = "pysot"
     forecasters: tuple[str, ...] = ("hold",)
@@ -128,6 +139,13 @@ class World:
         _check_kinds("latency", [self.latency], _PLUGIN, latency)
         traces = [*self.passes] if self.timing is None else [self.timing, *self.passes]
         _check_kinds("timing and passes", traces, _TRACE, _A_TRACE)
+        named("search", parse_search, text(self.search))
+        if self.pre_forecaster is not None and self.search == "off":
+            raise LaeError(
+                "pre_forecaster: what it is worth is the search model's: do not turn it off"
+            )
+        if self.keep_size and self.pre_forecaster is None:
+            raise LaeError("keep_size is a way to use a pre_forecaster")
         _check_kinds("convention", [self.convention], (str,), "a name, such as 'pysot'")
         _check_kinds("forecasters", self.forecasters, (str,), "a name, such as 'kalman'")
         _check_kinds("costs", self.costs, (str,), "text, such as '2ms' or 'kalman=2ms'")
@@ -157,6 +175,9 @@ class World:
         scale: Number = 1,
         timing: TraceLike | None = None,
         passes: TraceLike | Iterable[TraceLike] = (),
+        search: str = "trace",
+        pre_forecaster: str | None = None,
+        keep_size: bool = False,
         sigma: Number | Iterable[Number] = 0,
         convention: str = "pysot",
         forecasters: str | Iterable[str] = ("hold",),
@@ -177,6 +198,9 @@ class World:
             scale=named("scale", _factor, scale),
             timing=timing,
             passes=several(passes),
+            search=search,
+            pre_forecaster=pre_forecaster,
+            keep_size=keep_size,
             sigmas=named("sigma", parse_sigmas, sigma),
             convention=convention,
             forecasters=tuple(dict.fromkeys(several(forecasters))),
@@ -260,7 +284,11 @@ class World:
         return found if self.scale == 1 else f"{found} x {self.scale}"
 
     def replay(
-        self, trace: TraceLike, sequences: str | Iterable[str] | None = None, batch: bool = False
+        self,
+        trace: TraceLike,
+        sequences: str | Iterable[str] | None = None,
+        batch: bool = False,
+        pre_forecaster: AnyFactory | None = None,
     ) -> Runs:
         """Replay a trace in this world.
 
@@ -269,20 +297,23 @@ class World:
             sequences: those wanted; all by default.
             batch: schedule many sequences at once where policy and latency allow it (see
                 :func:`lae_sim.engine.lanes.batchable`). The runs are the same.
+            pre_forecaster: what the world's name of one stands for; without it, none is used.
 
         Raises:
             LaeError: if a trace is missing or damaged, or the passes do not go together.
         """
         names = None if sequences is None else sequence_names(sequences)
         opened = open_trace(trace, names)
+        strided, gaps = split_passes(map(open_trace, self.passes))
         return Runs(
             opened,
             Clock.at(opened.metadata.fps if self.fps is None else self.fps),
             scaled(self.source(), self.scale),
             self.rule(),
             None if self.timing is None else open_trace(self.timing),
-            tuple(open_trace(each, names) for each in self.passes),
+            (*(each if names is None else each.chosen(names) for each in strided), *gaps),
             batch,
+            find_search(self.search, opened.metadata, gaps, pre_forecaster, self.keep_size),
         )
 
 
@@ -295,13 +326,14 @@ def replay_trace(
     scale: Number = 1,
     timing: TraceLike | None = None,
     passes: TraceLike | Iterable[TraceLike] = (),
+    search: str = "trace",
     batch: bool = False,
 ) -> Runs:
     """Replay every sequence of a trace, one after another.
 
     Args:
         trace: the boxes and the truth: an open trace, or the path or URL of one.
-        fps, policy, latency, scale, timing, passes: see :meth:`World.of`.
+        fps, policy, latency, scale, timing, passes, search: see :meth:`World.of`.
         batch: see :meth:`World.replay`.
 
     Returns:
@@ -323,6 +355,7 @@ def replay_trace(
         policy=policy,
         latency=latency,
         scale=scale,
+        search=search,
         **open_others(timing, passes),
     )
     return world.replay(opened, batch=batch)

@@ -11,6 +11,7 @@ from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou
 from lae_sim.errors import TraceError
 from lae_sim.trace.columns import BOX, TRUTH, Rows
+from lae_sim.trace.restarts import is_restart
 
 COLUMN_TYPES = {
     "sequence": "string",
@@ -69,11 +70,13 @@ class RowChecker:
     Attributes:
         where: the file's name, for messages.
         profiled: whether units are known, so that none need be guessed from unlikely values.
+        restarts: whether the sequences are restarts, which are called so.
     """
 
-    def __init__(self, where: str, profiled: bool = False) -> None:
+    def __init__(self, where: str, profiled: bool = False, restarts: bool = False) -> None:
         self.where = where
         self.profiled = profiled
+        self.restarts = restarts
         self._last_name: str | None = None
         self._next_frame = 0
 
@@ -101,6 +104,9 @@ class RowChecker:
         for run, name in enumerate(rows.names):
             if not name or _SURROGATE.search(name):
                 problem = "the name is not Unicode text" if name else "the name is null or empty"
+                self._fail(rows, int(rows.starts[run]), "sequence", problem)
+            if self.restarts and not is_restart(name):
+                problem = "a restart is called SEQUENCE@START+GAP, such as 'car@12+6'"
                 self._fail(rows, int(rows.starts[run]), "sequence", problem)
             if run == 0 and name == self._last_name:
                 first_frames[0] = self._next_frame

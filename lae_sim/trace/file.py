@@ -128,7 +128,8 @@ def read_trace(path: str | os.PathLike[str], sequences: str | Iterable[str] | No
         raise LaeError(f"path: a trace is read from a path or a URL, not {shown(path)}")
     stored = _StoredRecordings(os.fspath(path))
     metadata, rows = stored.describe()
-    trace = Trace(metadata, replace(stored, profiled=metadata.profiled), rows)
+    stored = replace(stored, profiled=metadata.profiled, restarts=metadata.kind == "restarts")
+    trace = Trace(metadata, stored, rows)
     return trace if sequences is None else trace.chosen(sequences)
 
 
@@ -194,7 +195,8 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
         [pa.field(name, types[name], nullable=name not in ("sequence", "frame")) for name in types],
         {"lae_sim": trace.metadata.dumps()},
     )
-    check = RowChecker(str(path), profiled=trace.metadata.profiled)
+    metadata = trace.metadata
+    check = RowChecker(str(path), metadata.profiled, restarts=metadata.kind == "restarts")
     with (
         written_whole(path) as temporary,
         pq.ParquetWriter(
@@ -230,6 +232,7 @@ class _StoredRecordings:
     path: str
     keep: frozenset[str] | None = None
     profiled: bool = False
+    restarts: bool = False
 
     def describe(self) -> tuple[Metadata, int]:
         """The file's metadata and its number of rows."""
@@ -286,7 +289,7 @@ class _StoredRecordings:
 
     def _all(self) -> Iterator[Recording]:
         """Recordings, put together again where a batch ends inside one."""
-        check = RowChecker(self.path, profiled=self.profiled)
+        check = RowChecker(self.path, self.profiled, self.restarts)
         parts: list[Recording] = []
         for rows in self._rows():
             check(rows)

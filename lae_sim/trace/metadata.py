@@ -17,8 +17,26 @@ from lae_sim.errors import LaeError, TraceError
 
 FORMAT = "lae-trace"
 VERSION = "1.0"
-KINDS = ("every-frame", "real-time")
+RESTARTS_VERSION = "1.1"
+"""Of traces of kind restarts, which readers of 1.0 do not know; all others are readable by them."""
+KINDS = ("every-frame", "real-time", "restarts")
 TRACES_TIMES = "the trace's times: "
+
+
+@dataclass(frozen=True)
+class Search:
+    """Where a tracker says that it looks for its target: a square around its last answer.
+
+    Attributes:
+        half_side: half the square's side, in units of :func:`lae_sim.boxes.search_side`.
+        window: whether a cosine window weighs what is searched, so that a target near the edge is
+            harder to find; None if that is not said.
+        source: where the number is from, in words; None if that is not said.
+    """
+
+    half_side: float
+    window: bool | None = None
+    source: str | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -27,7 +45,7 @@ class Metadata:
 
     Attributes:
         fps: world frame rate, frames per second, exact.
-        kind: ``"every-frame"`` or ``"real-time"``.
+        kind: ``"every-frame"``, ``"real-time"`` or ``"restarts"``.
         document: the whole JSON object (see ``traces/FORMAT.md``).
 
     Example:
@@ -53,7 +71,7 @@ class Metadata:
 
         Args:
             fps: the frame rate, such as ``30`` or ``"30000/1001"``; text is kept as it is.
-            kind: ``"every-frame"`` or ``"real-time"``.
+            kind: ``"every-frame"``, ``"real-time"`` or ``"restarts"``.
             more: optional keys: ``tracker``, ``device``, ``timing``, ``dataset``, ``sequences``;
                 ``schedule`` adds to the schedule object.
 
@@ -62,8 +80,8 @@ class Metadata:
         """
         fps = fps if isinstance(fps, str) else str(exact(fps))
         schedule = {"kind": kind, **more.pop("schedule", {})}
-        document = {"format": FORMAT, "version": VERSION, "fps": fps, "schedule": schedule, **more}
-        return cls.of(document)
+        head = {"format": FORMAT, "version": version_of(kind), "fps": fps, "schedule": schedule}
+        return cls.of({**head, **more})
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Metadata:
@@ -127,6 +145,15 @@ class Metadata:
         return parse_rational(self.document["schedule"].get("stride", "1"))
 
     @property
+    def search(self) -> Search | None:
+        """Where the tracker says that it looks for its target; None if it does not say."""
+        declared = self.document.get("tracker", {}).get("search")
+        if declared is None:
+            return None
+        half_side, window, source = (declared.get(k) for k in ("half_side", "window", "source"))
+        return Search(float(half_side), window, source)
+
+    @property
     def profiled(self) -> bool:
         """Whether the trace names the clock of its times, as those of the profiler do."""
         return "clock" in self.document.get("timing", {})
@@ -165,6 +192,11 @@ class Metadata:
     def _sequence(self, sequence: str) -> Mapping[str, Any]:
         entry: Mapping[str, Any] = self.document.get("sequences", {}).get(sequence, {})
         return entry
+
+
+def version_of(kind: str) -> str:
+    """The oldest version of the format whose readers know a trace of this kind."""
+    return RESTARTS_VERSION if kind == "restarts" else VERSION
 
 
 def _finite(text: str) -> float:
@@ -208,6 +240,7 @@ def _checked(document: dict[str, Any]) -> dict[str, Any]:
     for key in ("tracker", "device", "timing", "sequences"):
         if not isinstance(document.get(key, {}), dict):
             raise TraceError(f"metadata key {key!r} must be a JSON object")
+    _check_search(document.get("tracker", {}).get("search"))
     for name, entry in document.get("sequences", {}).items():
         where = f"metadata of sequence {name[:80]!r}"
         if not isinstance(entry, dict):
@@ -223,3 +256,22 @@ def _checked(document: dict[str, Any]) -> dict[str, Any]:
         if not (isinstance(attributes, list) and all(isinstance(a, str) for a in attributes)):
             raise TraceError(f"{where}: 'attributes' must be a list of names")
     return document
+
+
+def _check_search(search: Any) -> None:
+    """Check what a tracker declares of its search region."""
+    where = "metadata key 'tracker.search"
+    if search is None:
+        return
+    if not isinstance(search, dict):
+        raise TraceError(f"{where}' must be a JSON object")
+    side: Any = search.get("half_side")
+    if type(side) not in (int, float) or not 0 < side < 1e9:
+        raise TraceError(
+            f"{where}.half_side' must be a number above 0, in units of sqrt((w + p)(h + p)), "
+            "p = (w + h) / 2, such as 1.0"
+        )
+    if not isinstance(search.get("window"), (bool, type(None))):
+        raise TraceError(f"{where}.window' must be true or false")
+    if not isinstance(search.get("source"), (str, type(None))):
+        raise TraceError(f"{where}.source' must be text: where the number is from")

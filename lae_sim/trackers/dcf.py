@@ -139,8 +139,14 @@ class Dcf:
             self._torch.cuda.synchronize(self._device)
 
     def describe(self) -> dict[str, Any]:
-        """Name, version and settings."""
-        return {"name": "dcf", "version": "1", "settings": self._settings}
+        """Name, version, settings, and where it searches."""
+        search = {
+            # half the window over sqrt((w + p)(h + p)), which is 2 sqrt(w h) of a square target
+            "half_side": self._padding / 4,
+            "window": True,
+            "source": f"a window of {self._padding:g} sqrt(w h), tapered; less for oblong targets",
+        }
+        return {"name": "dcf", "version": "1", "settings": self._settings, "search": search}
 
     def _to(self, array: Array) -> Any:
         return self._torch.from_numpy(array).to(self._device) if self._torch else array

@@ -143,6 +143,11 @@ class NanoTrack:
                 "lr": self._rate,
             },
             "weights_digest": self._digest,
+            "search": {
+                "half_side": SEARCH // TEMPLATE / 2,
+                "window": self._influence > 0,
+                "source": f"crops of {TEMPLATE} and {SEARCH} pixels",
+            },
         }
 
     def _context_side(self) -> float:

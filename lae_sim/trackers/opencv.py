@@ -25,6 +25,18 @@ _FILES = {
     "goturn": {"model": "modelBin", "prototxt": "modelTxt"},
 }
 
+# Half the side of the search region of a square target over sqrt((w + p)(h + p)), p = (w + h) / 2;
+# whether a cosine window weighs it; and what OpenCV's sources have. The others search a number of
+# pixels, follow points, or look everywhere.
+_SEARCH = {
+    "nano": (1.0, True, "crops of 127 and 255 pixels"),
+    "dasiamrpn": (271 / 127 / 2, True, "crops of 127 and 271 pixels"),
+    "vit": (1.0, True, "a crop of 4 sqrt(w h)"),
+    "goturn": (0.5, False, "a crop of 2 w, 2 h"),
+    "csrt": (1.0, True, "a window of w + 3 sqrt(w h), tapered"),
+    "kcf": (0.5, True, "a window of 2 w, 2 h, tapered"),
+}
+
 # Pixels of a side, and of the area: with less these never return from init, for they draw random
 # features until enough of them fit into the box.
 _SMALLEST = {"mil": (2, 25), "boosting": (2, 25), "tld": (2, 4)}
@@ -125,7 +137,7 @@ class OpenCv:
         return (tuple(box), score) if score > 0 else tuple(box)
 
     def describe(self) -> dict[str, Any]:
-        """Name, version, settings and digest of the weights, SHA-256 of the files."""
+        """Name, version, settings, search, and digest of the weights, SHA-256 of the files."""
         settings = {"seed": self._seed}
         description = {
             "name": f"opencv:{self._name}",
@@ -135,6 +147,9 @@ class OpenCv:
         if self._files:
             settings["network_loaded_in_init"] = self._networks is None
             description["weights_digest"] = self._digest
+        if self._name in _SEARCH:
+            half_side, window, source = _SEARCH[self._name]
+            description["search"] = {"half_side": half_side, "window": window, "source": source}
         return description
 
     def _loaded(self) -> list[Any] | None:

@@ -36,7 +36,12 @@ class Tracker(Protocol):
       size (float, pixels) instead of where it was last seen;
     - ``sync()``: wait for the device to finish; the stopwatch calls it before each reading (for
       torch on CUDA it does so itself);
-    - ``describe() -> dict``: name, version, settings, weights_digest, libraries (JSON values);
+    - ``describe() -> dict``: name, version, settings, weights_digest, libraries (JSON values), and
+      search: ``{"half_side": 1.0, "window": True, "source": "127 and 255 pixels"}``, where it looks
+      for the target. A square around the last answer, half its side in units of
+      ``sqrt((w + p)(h + p))``, ``p = (w + h) / 2``, of that answer (a Siamese tracker's exemplar);
+      whether a cosine window weighs what is searched, so that a target near its edge is harder to
+      find; and where the number is from, in words. Leave search out where it is not known;
     - ``close()``: give resources back.
     """
 

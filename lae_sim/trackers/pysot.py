@@ -132,7 +132,24 @@ class PySot:
             },
             "weights_digest": weights_digest(self._snapshot),
             "libraries": {"cuda": self._torch.version.cuda},
+            **self._search(),
         }
+
+    def _search(self) -> dict[str, Any]:
+        """Where it searches, if the configuration says it as the toolkit's own do."""
+        track: Any = getattr(self._cfg, "TRACK", None)
+        names = ("EXEMPLAR_SIZE", "INSTANCE_SIZE", "WINDOW_INFLUENCE")
+        if not all(hasattr(track, name) for name in names):
+            return {}
+        if getattr(track, "CONTEXT_AMOUNT", 0.5) != 0.5:  # another unit than the exemplar's
+            return {}
+        exemplar, instance, influence = (getattr(track, name) for name in names)
+        search = {
+            "half_side": instance / exemplar / 2,
+            "window": influence > 0,
+            "source": f"crops of {exemplar} and {instance} pixels ({self._config.name})",
+        }
+        return {"search": search}
 
     def _import(self, file: Path) -> Any:
         parts = file.relative_to(self._checkout).with_suffix("").parts

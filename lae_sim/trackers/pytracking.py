@@ -182,7 +182,21 @@ class PyTracking:
             "settings": dict(settings),
             "weights_digest": weights_digest(self._network),
             "libraries": {"cuda": self._torch.version.cuda},
+            **self._search(),
         }
+
+    def _search(self) -> dict[str, Any]:
+        """Where it searches, if the parameters say it: a square of ``scale sqrt(w h)``."""
+        scale = getattr(self._params, "search_area_scale", None)
+        if not scale:
+            return {}
+        search = {
+            # over sqrt((w + p)(h + p)), which is 2 sqrt(w h) of a square target
+            "half_side": scale / 4,
+            "window": bool(getattr(self._params, "window_output", False)),
+            "source": f"search_area_scale {scale:g}; less for oblong targets",
+        }
+        return {"search": search}
 
     def _rgb(self, frame: Image) -> Any:
         return self._cv2.cvtColor(frame, self._cv2.COLOR_BGR2RGB)

@@ -30,8 +30,8 @@ def metadata(time: str) -> Metadata:
 
 
 def a_pass(tmp_path: Path, tracker: FakeTimed, time: str = "1") -> Pass:
-    def run(sequence: ImageSequence, **more: Any) -> LiveRun:
-        return run_every_frame(sequence, tracker, **more)
+    def run(sequence: ImageSequence, **more: Any) -> list[LiveRun]:
+        return [run_every_frame(sequence, tracker, **more)]
 
     return Pass("first", tmp_path / "t.parquet", metadata(time), run)
 
@@ -111,7 +111,7 @@ def test_a_journal_keeps_any_name(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "t.unfinished", {}, resume=False)
     for name in names:
         recording = Recording.new(name, [[1, 1, 1, 1]], [[1, 1, 1, 1]], [1])
-        journal.add("first", recording, metadata(json.dumps(name)))
+        journal.add("first", name, [recording], metadata(json.dumps(name)))
     assert journal.finished("first") == names
     assert [recording.name for recording in journal.recordings("first")] == names
 
