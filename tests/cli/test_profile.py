@@ -147,8 +147,7 @@ def test_json_says_the_same(here: Path) -> None:
         "mine-Bright-data.closed-loop-0.5ms.parquet",
         "mine-Bright-data.closed-loop-0.5ms-init-1000ms.parquet",
     ]
-    slow = read_trace(report["traces"][-1]["trace"])["a"]
-    assert np.flatnonzero(slow.elapsed_ns >= 0).tolist()[:1] == [0]
+    slow = read_trace(here / report["traces"][-1]["trace"])["a"]
     assert slow.elapsed_ns[0] == 1_000_000_000
     assert report["traces"][-1]["timing"].startswith("constant 0.5ms, initialisation 1000 ms")
     assert report["traces"][0]["world_frames"] == report["traces"][0]["processed"] == 20

@@ -488,7 +488,7 @@ def test_measured_initialisations_are_called_so(tmp_path):
     assert replay_json(tmp_path / "m.parquet")["traces"][0]["init"]["source"] == "measured"
     timed = replay_json(SLOW, "--timing", tmp_path / "m.parquet")["traces"][0]
     assert timed["init"]["source"] == "measured"
-    assert "ms), measured\n" in replay(tmp_path / "m.parquet")
+    assert "initialisation costs 282 ms, measured\n" in replay(tmp_path / "m.parquet")
     noted = {"timing": {"source": "measured", "note": "initialisations are unknown"}}
     written(tmp_path / "n.parquet", list(trace), **noted)
     assert "the trace's times: measured; initialisations" in replay(tmp_path / "n.parquet")
