@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -254,18 +254,30 @@ class Gaps:
         When it gets short, time is kept for the own jumps of the sequences to come.
         """
         own = own_starts(sequence, self._plan.own_gaps)
+        began = time.monotonic()
+        made = list(self._in_time(own, sequence, self._deadline, progress))
+        if own:
+            self._own_s = max(self._own_s, (time.monotonic() - began) / len(own))
         self._own_left -= len(own)
-        reserved_s = self._own_left * self._own_s
-        made: list[LiveRun | Failure] = []
-        for starts, kept_s in ((own, 0.0), (self._sampled[sequence.name], reserved_s)):
-            ahead = _ReadAhead(sequence.read, starts)
-            read = sequence.read if self._options.get("include_decode") else ahead
-            for start in starts:
-                if time.monotonic() + kept_s < self._deadline:
-                    made.append(self._made(start, sequence, read))
-                progress(len(start.frames))
-                ahead.done(start)
+        deadline = self._deadline - self._own_left * self._own_s
+        made += self._in_time(self._sampled[sequence.name], sequence, deadline, progress)
         return made
+
+    def _in_time(
+        self,
+        starts: Sequence[Start],
+        sequence: ImageSequence,
+        deadline: float,
+        progress: Callable[[int], object],
+    ) -> Iterator[LiveRun | Failure]:
+        """Those that can begin before a deadline, made."""
+        ahead = _ReadAhead(sequence.read, starts)
+        read = sequence.read if self._options.get("include_decode") else ahead
+        for start in starts:
+            if time.monotonic() < deadline:
+                yield self._made(start, sequence, read)
+            progress(len(start.frames))
+            ahead.done(start)
 
     def schedule(self, names: Collection[str]) -> dict[str, Any]:
         """What the metadata says of the restarts that were made, by their names."""
