@@ -79,10 +79,10 @@ class GapPlan:
             init_s, call_s: what an initialisation and another call take, s.
         """
         own_s = sequences * (init_s + len(FOLLOWED) * call_s)
-        own = min(int(budget_s / own_s), len(OWN_GAPS)) if own_s else len(OWN_GAPS)
+        own = int(min(budget_s / own_s, len(OWN_GAPS))) if own_s else len(OWN_GAPS)
         left_s = budget_s - own * own_s
         one_s = init_s + call_s
-        sampled = min(int(left_s / one_s), SAMPLED) if one_s else SAMPLED
+        sampled = int(min(left_s / one_s, SAMPLED)) if one_s else SAMPLED
         middles = [(2 * k + 1) * len(OWN_GAPS) // (2 * own) for k in range(own)]
         return cls(tuple(OWN_GAPS[k] for k in middles), sampled)
 
@@ -224,6 +224,9 @@ class Gaps:
         self._budget_s = budget_ns / NS_PER_SECOND
         self._farthest = UNDECLARED_FARTHEST if half_side is None else BEYOND * half_side
         self._notice = notice
+        self._own = self._own_left = self._picked = 0
+        self._own_s = 0.0
+        self._sampled: dict[str, list[Start]] = {}
         self._use(GapPlan(), math.inf, 0.0)
 
     def prepare(self, journal: Journal) -> None:
@@ -255,7 +258,8 @@ class Gaps:
         """
         own = own_starts(sequence, self._plan.own_gaps)
         began = time.monotonic()
-        made = list(self._in_time(own, sequence, self._deadline, progress))
+        made: list[LiveRun | Failure] = []
+        made += self._in_time(own, sequence, self._deadline, progress)
         if own:
             self._own_s = max(self._own_s, (time.monotonic() - began) / len(own))
         self._own_left -= len(own)
