@@ -146,7 +146,7 @@ class Evaluated:
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
             "device": metadata.device,
-            "strided": [path_of(trace) or "an open trace" for trace in runs.passes],
+            "strided": [path_of(trace) or "an open trace" for trace in runs.strided],
             "times_from": path if runs.timing is None else path_of(runs.timing) or "an open trace",
             "times_note": times.metadata.timing_note,
             "fps": str(runs.clock.fps),

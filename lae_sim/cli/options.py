@@ -44,7 +44,7 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
         default=[],
         metavar="TRACE",
         help="passes on every N-th frame (lae-sim profile --stride): each sequence's boxes come "
-        "from the pass that is nearest to the frames skipped",
+        "from the pass that is nearest to the frames skipped; and gap passes (--gaps)",
     )
 
 
