@@ -270,6 +270,11 @@ class Runs:
         return split_passes(self.passes)[0]
 
     @property
+    def gap_passes(self) -> tuple[Trace, ...]:
+        """The passes that measure how far the tracker reaches."""
+        return split_passes(self.passes)[1]
+
+    @property
     def times(self) -> Trace:
         """The trace that the times are taken from."""
         return self.trace if self.timing is None else self.timing
