@@ -18,7 +18,6 @@ from lae_sim.evaluation.metrics import find_convention
 from lae_sim.evaluation.modelled import MODELLED
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import load_forecaster
-from lae_sim.replay.latency import time_label
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.search import SearchModel, find_search
 from lae_sim.replay.world import parse_policy
@@ -381,7 +380,7 @@ class _Setting:
 
     def __str__(self) -> str:
         varied = f" +- {self.spread:.0%}" if self.spread >= 0.005 else ""
-        call, init = (time_label(round(ns, -4)) for ns in (self.call_ns, self.init_ns))
+        call, init = (f"{round(ns / 1e6, 2):g} ms" for ns in (self.call_ns, self.init_ns))
         return f"{call}{varied}, init {init}, {self.rules}"
 
     def is_like(self, other: _Setting) -> bool:
