@@ -226,6 +226,11 @@ class Outcomes:
     known: bool
     forecast: bool = False
 
+    @property
+    def likeliest(self) -> Floats:
+        """The boxes of the likeliest run, float64 [n, 4]; of the middle of an assumed range."""
+        return self.boxes[int(self.weights[len(self.weights) // 2].argmax())]
+
 
 class _Walk:
     """Runs of a tracker that searches at its last answer.
