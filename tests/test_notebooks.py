@@ -13,6 +13,7 @@ PICTURES = {
     "02_profile_your_device": 4,
     "03_compare_forecasters": 7,
     "04_full_study": 4,
+    "06_how_far_to_trust_a_replay": 2,
 }
 IMAGES = {"image/png", "image/svg+xml"}
 
