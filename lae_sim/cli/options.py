@@ -52,8 +52,13 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
     )
 
 
-def add_search(parser: argparse.ArgumentParser) -> None:
-    """Add what the search model takes: how far the tracker reaches, and from where."""
+def add_search(parser: argparse.ArgumentParser, pre_forecaster: bool = True) -> None:
+    """Add what the search model takes: how far the tracker reaches, and from where.
+
+    Args:
+        parser: the command line.
+        pre_forecaster: whether it may say where the tracker searches.
+    """
     add = parser.add_argument_group("the search model").add_argument
     add(
         "--search",
@@ -62,6 +67,8 @@ def add_search(parser: argparse.ArgumentParser) -> None:
         help="how far the tracker finds its target: c=0.7 search sides, a range c=0.6-1.0, what "
         "the traces know (trace, the default), or no search model (off)",
     )
+    if not pre_forecaster:
+        return
     add(
         "--pre-forecaster",
         metavar="NAME",

@@ -26,6 +26,7 @@ from lae_sim.trace.file import Trace
 from lae_sim.trace.recording import Recording, batched
 
 _GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
+_LEAST = 0.2  # weight of the farther of two strides beside a step
 _LANE_FRAMES = 1 << 21  # and of their repetitions
 
 
@@ -145,15 +146,15 @@ class _Job:
         passes = {self.stride: self.recording, **self.passes}
         strides = sorted(passes)
         nearest = _nearest(strides, frames)
-        source = passes[strides[nearest]]
-        boxes = _boxes(source, frames)
-        before = self.before if source is self.recording else _before(source, strides[nearest])
+        stride = strides[nearest]
+        boxes = _boxes(passes[stride], frames)
+        before = self.before if stride == self.stride else _before(passes[stride], stride)
         departures = _departures(before, frames)
         disagreement = np.nan
         if self.passes:
             parted = np.zeros(len(frames), bool)
-            for stride in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
-                parted |= iou(_boxes(passes[stride], frames), boxes) < PARTED_IOU
+            for other in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
+                parted |= iou(_boxes(passes[other], frames), boxes) < PARTED_IOU
             disagreement = float(parted.mean())
         run = Run(self.recording, schedule, boxes, departures, disagreement)
         if self.search is None or not (departures or self.search.pre_forecaster is not None):
@@ -161,8 +162,8 @@ class _Job:
         farther = np.append(False, np.diff(frames) > (frames - before.take(frames))[1:])
         recorded = [RecordedAnswers(boxes, farther)]
         if self.passes:
-            for stride in _beside(strides, frames):
-                recorded += phase_answers(stride, passes[stride], frames)
+            for other, weight in _beside(strides, frames).items():
+                recorded += phase_answers(other, passes[other], frames, weight)
         modelled = self.search.outcomes(self.recording, frames, recorded, self.image_size)
         return replace(run, modelled=modelled)
 
@@ -203,16 +204,21 @@ def _nearest(strides: Sequence[Fraction], frames: Ints) -> int:
     return min(range(len(strides)), key=lambda k: abs(strides[k] - step))
 
 
-def _beside(strides: Sequence[Fraction], frames: Ints) -> list[Fraction]:
-    """The strides next below and above the mean step of some processed frames.
+def _beside(strides: Sequence[Fraction], frames: Ints) -> dict[Fraction, float]:
+    """The strides next below and above the mean step of some processed frames, with weights.
 
-    The step from the initialisation does not count: a long one says nothing of those after it.
+    The nearer one weighs more; both weigh something, since steps differ from each other. The step
+    from the initialisation does not count: a long one says nothing of those after it.
     """
     after = frames[1:] if len(frames) > 2 else frames
     step = Fraction(int(after[-1] - after[0]), max(len(after) - 1, 1))
     below = max((stride for stride in strides if stride <= step), default=strides[0])
     above = min((stride for stride in strides if stride >= step), default=strides[-1])
-    return sorted({below, above})
+    if below == above:
+        return {below: 1.0}
+    share = float((step - below) / (above - below))
+    share = min(max(share, _LEAST), 1 - _LEAST)
+    return {below: 1 - share, above: share}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -268,6 +274,11 @@ class Runs:
     def strided(self) -> tuple[Trace, ...]:
         """The passes at other strides."""
         return split_passes(self.passes)[0]
+
+    @property
+    def gap_passes(self) -> tuple[Trace, ...]:
+        """The passes that measure how far the tracker reaches."""
+        return split_passes(self.passes)[1]
 
     @property
     def times(self) -> Trace:
