@@ -12,7 +12,7 @@ there is left out.
 
 Sources: Li et al., "Predictive Visual Tracking: A New Benchmark and Baseline Approach" (2021),
 Tables II and III, and ``fig/overall.png`` of its repository (github.com/vision4robotics/
-LAE-PVT-master), which is another run and has the trackers' offline scores.
+LAE-PVT-master): another run without forecasters, and the trackers' offline scores, told by colour.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ def replayed(
     """
     frame_ms = round(1000 / fps)
     world = World.of(latency=f"constant:{frame_ms}ms,init={max(init_ms, frame_ms)}ms", search="off")
-    found = {}
+    found: dict[str, Floats] = {}
     for pre, searched in (
         (None, {"none": "hold", "post": "kalman"}),
         ("kalman", {"pre": "hold", "both": "kalman"}),
@@ -240,7 +240,7 @@ def replayed(
             np.array(reaches, float),
             known=False,  # every reach has figures of its own
             source="assumed",
-            pre_forecaster=pre and load_forecaster(pre),
+            pre_forecaster=None if pre is None else load_forecaster(pre),
             keep_size=pre is not None,
         )
         runs, weights = [], []
@@ -326,7 +326,8 @@ class Fit:
 
     def error(self, which: Bools | slice = slice(None)) -> Floats:
         """Mean absolute difference of some figures, float64 [I, C]."""
-        return np.abs(self.differences[which]).mean(axis=0)
+        error: Floats = np.abs(self.differences[which]).mean(axis=0)
+        return error
 
     def best(self, which: Bools | slice = slice(None)) -> tuple[int, int]:
         """Where that is least: the places of an initialisation and a c."""
