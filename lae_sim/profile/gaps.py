@@ -320,7 +320,7 @@ class Gaps:
     def _probed(self) -> tuple[float, float]:
         """What an initialisation and another call take with all around them, s; 0 if unknown."""
         count = len(self._sequences)
-        places = dict.fromkeys(k * (count - 1) // (_PROBES - 1) for k in range(_PROBES))
+        places = [k * (count - 1) // (_PROBES - 1) for k in range(_PROBES)]
         took = []
         for sequence in (self._sequences[place] for place in places):
             for start in own_starts(sequence, OWN_GAPS[:1]):
