@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from lae_sim.engine.clock import Clock
+from lae_sim.evaluation.caveats import left_search
 from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import by_frame, constant, scaled
 from lae_sim.replay.run import replay_sequence
-from lae_sim.replay.world import SIGMA_GRID
+from lae_sim.replay.world import SIGMA_GRID, replay_trace
 from lae_sim.study.run import compute_study, flat_rows
 from lae_sim.study.spec import Study
 from lae_sim.trace.file import Trace, read_trace, write_trace
@@ -145,3 +146,12 @@ def test_offline_values_do_not_depend_on_latency(nanotrack: Trace) -> None:
     found = evaluate_runs(runs, METADATA, FORECASTERS)
     for metric, offline in found.offline.items():
         assert found.scores[metric][0, :, 0].tolist() == offline.tolist()
+
+
+@pytest.mark.parametrize(("init", "count"), [("300ms", 13), ("500ms", 29), ("1s", 44)])
+def test_targets_of_dtb70_leave_the_search_region_during_a_slow_initialisation(
+    nanotrack: Trace, init: str, count: int
+) -> None:
+    runs = replay_trace(nanotrack, latency=f"constant:47ms,init={init}")
+    found = evaluate_runs(runs, METADATA, {"hold": FORECASTERS["hold"]}).replay
+    assert len(left_search(found)) == count

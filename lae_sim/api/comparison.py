@@ -71,9 +71,18 @@ class ComparisonResult:
 
     @property
     def notes(self) -> list[str]:
-        """What was trained, and which replays are approximations."""
+        """What was trained, what initialisation costs, and which replays are approximations."""
         notes: list[str] = self.scores.attrs["notes"]
         return notes
+
+    @property
+    def init(self) -> list[dict[str, Any]]:
+        """What initialisations cost in each replay (see :class:`lae_sim.trace.describe.InitCost`).
+
+        ``left_search`` names the sequences whose target leaves the search region meanwhile.
+        """
+        costs: list[dict[str, Any]] = self.scores.attrs["init"]
+        return costs
 
     @cached_property
     def summary(self) -> DataFrame:

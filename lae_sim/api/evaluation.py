@@ -31,6 +31,7 @@ from lae_sim.errors import LaeError, hint, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
+from lae_sim.evaluation.modelled import MODELLED
 from lae_sim.evaluation.totals import Totals
 from lae_sim.files import sequence_names
 from lae_sim.forecast.base import AnyFactory
@@ -40,7 +41,13 @@ from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import TraceLike, World, label_of, named, open_others
-from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
+from lae_sim.report.replay import (
+    SequenceRows,
+    attribute_members,
+    search_report,
+    trace_report,
+)
+from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
 
 if TYPE_CHECKING:
@@ -89,7 +96,7 @@ class Scenario:
         """
         metadata, convention = self.trace.metadata, find_convention(self.world.convention)
         stalls = SkippedStalls()
-        if self.world.latency == "recorded" and self.world.timing is None:
+        if self.world.times_kind == "recorded" and self.world.timing is None:
             observers = [*observers, stalls]
 
         def runs() -> Iterator[Run]:
@@ -135,20 +142,27 @@ class Evaluated:
     rows: SequenceRows
     notes: tuple[str, ...]
 
+    @property
+    def init(self) -> InitCost:
+        """What initialisations cost."""
+        source = self.scenario.world.init_source(self.scenario.runs.times.metadata)
+        return InitCost.of(self.totals.replay.init_ns, source)
+
     def document(self, attributes: bool = False, per_sequence: bool = False) -> dict[str, Any]:
         """The scores as a JSON object, as ``lae-sim replay --json`` has them."""
         scenario, world = self.scenario, self.scenario.world
         metadata, runs = scenario.trace.metadata, scenario.runs
         path = path_of(scenario.trace) or scenario.label
-        times = runs.trace if runs.timing is None else runs.timing
         return {
             "trace": path,
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
             "device": metadata.device,
             "strided": [path_of(trace) or "an open trace" for trace in runs.strided],
+            "gap_passes": [path_of(trace) or "an open trace" for trace in runs.gap_passes],
+            "search": search_report(runs.search, world.pre_forecaster, self.totals.modelled),
             "times_from": path if runs.timing is None else path_of(runs.timing) or "an open trace",
-            "times_note": times.metadata.timing_note,
+            "times_note": runs.times.metadata.timing_note,
             "fps": str(runs.clock.fps),
             "policy": label_of(world.policy),
             "latency": label_of(world.latency),
@@ -162,6 +176,7 @@ class Evaluated:
                 list(scenario.forecasters),
                 world.sigmas,
                 world.convention,
+                self.init,
                 self.rows if per_sequence else None,
                 attributes,
             ),
@@ -197,15 +212,18 @@ def scenarios(
         made: dict[tuple[Fraction, str], AnyFactory] = {}  # once for all worlds of a rate
         for world in worlds:
             find_convention(world.convention)
-            runs = world.replay(trace, names)
-            rate, wanted = runs.clock.fps, list(dict.fromkeys(["hold", *world.forecasters]))
-            if any((rate, name) not in made for name in wanted):
+            rate = trace.metadata.fps if world.fps is None else world.fps
+            wanted = list(dict.fromkeys(["hold", *world.forecasters]))
+            searching = [] if world.pre_forecaster is None else [world.pre_forecaster]
+            if any((rate, name) not in made for name in [*wanted, *searching]):
                 camera = camera_of(root, dataset, names, rate, camera_lag)
-            for name in wanted:
+            for name in [*wanted, *searching]:
                 each = (forecasters or {}).get(name, name)
                 if (rate, name) not in made:
                     loaded = load_forecaster(each, camera) if isinstance(each, str) else each
                     made[rate, name] = loaded
+            searches = made[rate, searching[0]] if searching else None
+            runs = world.replay(trace, names, pre_forecaster=searches)
             factories = {name: made[rate, name] for name in wanted}
             if costs is None:  # measured once: a sweep is of nothing else
                 costs = resolve_costs(world.costs, factories, trace)
@@ -213,6 +231,7 @@ def scenarios(
     return found
 
 
+_MODELLED = ("auc", "auc_low", "auc_high", "dp20", "dp20_low", "dp20_high")
 SETTING = (
     *("trace", "tracker", "dataset", "times_from"),
     *("policy", "fps", "latency", "scale", "convention"),
@@ -251,8 +270,10 @@ class EvaluationResult:
 
         Columns: what the row is of (:data:`SETTING`, forecaster, sigma), the number of sequences,
         the scores and offline scores in 0..1, the share of the latency loss ``recovered`` (NaN if
-        unknown), ``mismatch_mean`` in frames, ``age_ms``, ``skip_rate``, and ``exact``: whether
-        every output follows the frame that it followed when it was recorded.
+        unknown), ``modelled_auc`` and ``modelled_dp20`` under the search model with the ends of
+        their intervals, ``_low`` and ``_high`` (NaN where the replay is exact), ``mismatch_mean``
+        in frames, ``age_ms``, ``skip_rate``, and ``exact``: whether every output follows the frame
+        that it followed when it was recorded.
         """
         import pandas as pd
 
@@ -261,6 +282,7 @@ class EvaluationResult:
             document = part.document()
             offline = document["offline"] or dict.fromkeys(METRICS)
             for result in document["results"]:
+                modelled = result["modelled"] or dict.fromkeys(_MODELLED)
                 rows.append(
                     {
                         **_setting(part.scenario),
@@ -271,6 +293,7 @@ class EvaluationResult:
                         **{f"offline_{metric}": offline[metric] for metric in METRICS},
                         "recovered_auc": result["recovered_auc"],
                         "recovered_dp20": result["recovered_dp20"],
+                        **{f"modelled_{name}": modelled[name] for name in _MODELLED},
                         "mismatch_mean": result["mismatch_mean"],
                         "age_ms": result["age_ms"],
                         "skip_rate": document["skip_rate"],
@@ -278,7 +301,7 @@ class EvaluationResult:
                     }
                 )
         numbers = [f"{place}{metric}" for place in ("", "offline_") for metric in METRICS]
-        numbers += ["recovered_auc", "recovered_dp20"]
+        numbers += ["recovered_auc", "recovered_dp20", *(f"modelled_{name}" for name in _MODELLED)]
         return pd.DataFrame(rows).astype(dict.fromkeys(numbers, "float64"))
 
     @cached_property
@@ -288,7 +311,7 @@ class EvaluationResult:
         notes = [
             (f"{part.scenario.label}: " if several else "") + note
             for part in self.parts
-            for note in (*part.notes, *_exactness(part))
+            for note in (*part.notes, *_assumption(part), *_exactness(part))
         ]
         return list(dict.fromkeys(notes))
 
@@ -296,7 +319,8 @@ class EvaluationResult:
         """Every score: a row per trace, world, sequence, forecaster and permitted latency.
 
         Columns: :data:`SETTING`, sequence, forecaster, sigma; the scores and offline scores in
-        0..1 (NaN where the sequence leaves the mean); ``world_frames``, ``processed`` and
+        0..1 (NaN where the sequence leaves the mean); ``modelled_auc``, ``modelled_dp20`` and the
+        ends of their intervals (NaN where the replay is exact); ``world_frames``, ``processed`` and
         ``approximate_outputs``; ``mismatch_mean`` in frames.
         """
         import pandas as pd
@@ -437,6 +461,15 @@ def _sequence_table(
     frames = replay.frames[:, None]
     columns: dict[str, Any] = {metric: scored.scores[metric] for metric in METRICS}
     columns |= {f"offline_{metric}": scored.offline[metric][:, None] for metric in METRICS}
+    for end in ("mean", "low", "high"):
+        values = getattr(scored.modelled, end)
+        suffix = "" if end == "mean" else f"_{end}"
+        columns |= {
+            f"modelled_{metric}{suffix}": np.where(
+                scored.modelled.applies[:, None], values[metric], np.nan
+            )
+            for metric in MODELLED
+        }
     columns |= {
         "world_frames": frames,
         "processed": replay.processed[:, None],
@@ -446,6 +479,10 @@ def _sequence_table(
     shape = tuple(map(len, axes))
     flat = {name: np.broadcast_to(values, shape).ravel() for name, values in columns.items()}
     return pd.DataFrame(flat, index).reset_index()
+
+
+def _assumption(part: Evaluated) -> list[str]:
+    return [] if part.init.is_measured else [str(part.init)]
 
 
 def _exactness(part: Evaluated) -> list[str]:
@@ -510,6 +547,9 @@ def evaluate(
     policy: str | Policy | Sequence[str | Policy] = "latest",
     timing: TraceLike | None = None,
     passes: TraceLike | Sequence[TraceLike] = (),
+    search: str = "trace",
+    pre_forecaster: str | None = None,
+    keep_size: bool = False,
     convention: str = "pysot",
     costs: Costs = (),
     sequences: str | Iterable[str] | None = None,
@@ -529,12 +569,18 @@ def evaluate(
         forecasters: names, classes or factories, or a mapping from names to these; ``"hold"``, the
             baseline, is always scored.
         sigma: permitted latencies in frames, or ``"grid"`` for 0, 0.02, ..., 1.
-        latency: where processing times come from, such as ``"recorded"`` or ``"constant:47ms"``.
+        latency: where processing times come from, such as ``"recorded"``, ``"constant:47ms"`` or,
+            with the initialisation told apart, ``"constant:47ms,init=800ms"``.
         scale: exact factor on all times: ``1.5`` is 3/2, ``0.1`` is 1/10.
         fps: frames that the world shows per second, such as ``30`` or ``"30000/1001"``.
         policy: which frame a free tracker takes, such as ``"latest"`` or ``"fifo"``.
         timing: another device's trace of the same sequences, to take the times from.
-        passes: traces of the same tracker at other strides.
+        passes: further traces of the same tracker: at other strides, and gap passes.
+        search: how far the tracker finds its target: ``"trace"`` (what trace and gap passes know),
+            ``"c=0.7"``, ``"c=0.6-1.0"`` or ``"off"`` (see
+            :func:`lae_sim.replay.search.parse_search`).
+        pre_forecaster: the forecaster that says where the tracker searches; its worth is modelled.
+        keep_size: whether it says the centre only.
         convention: how frames and thresholds count.
         costs: what forecasting costs: ``"2ms"``, ``"kalman=2ms"`` or ``{"kalman": "2ms"}``.
         sequences: those wanted; all by default.
@@ -563,6 +609,9 @@ def evaluate(
         policy=policy,
         latency=latency,
         scale=scale,
+        search=search,
+        pre_forecaster=pre_forecaster,
+        keep_size=keep_size,
         sigma=sigma,
         convention=convention,
         forecasters=makers,

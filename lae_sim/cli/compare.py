@@ -30,6 +30,7 @@ EXAMPLES = f"""\
 examples:
   lae-sim compare traces/*.parquet
   lae-sim compare nano.parquet --latency constant:20ms constant:47ms --plot comparison.png
+  lae-sim compare nano.parquet --latency constant:47ms,init=800ms by-call,init=1s
   lae-sim compare nano.parquet --latency-scale 1/2 1 2 4 --forecaster kalman learned --attributes
   lae-sim compare nano.parquet --forecaster kalman camera+kalman --root ~/data/DTB70 --out all.csv
   lae-sim compare nano.parquet --forecaster kalman mine:Midway --cost mine:Midway=2ms --json
@@ -135,6 +136,7 @@ def _compare(arguments: argparse.Namespace) -> None:
             "policy": arguments.policy,
             "seed": arguments.seed,
             "method": result.summary.attrs["method"],
+            "init": result.init,
             "notes": result.notes,
             **{name: _records(table) for name, table in tables.items()},
         }

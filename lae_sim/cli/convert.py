@@ -31,7 +31,7 @@ formats (auto tells them apart):
 
 examples:
   lae-sim convert results/kcf --truth OTB100 --out kcf.parquet
-  lae-sim convert NanoTrackV3.npz --truth DTB70 --time constant:47ms --out nano.parquet
+  lae-sim convert NanoTrackV3.npz --truth DTB70 --time constant:47ms,init=800ms --out n.parquet
   lae-sim convert results/ECO --truth UAV123_10fps --fps 10 --time mean-fps:13.5 --out eco.parquet
   lae-sim convert results_rt_raw/siamrpn --truth UAVDT --device 'AGX Xavier' --out rt.parquet
   lae-sim convert results/kcf --truth OTB100 --truth-file Tiger1=Tiger1_354.txt --out kcf.parquet
@@ -64,7 +64,8 @@ def _parser() -> argparse.ArgumentParser:
         "--time",
         default="measured",
         help="measured (default), constant:47ms, mean-fps:120, or mean-fps:FILE.csv with columns "
-        "sequence, fps and perhaps tracker, frames",
+        "sequence, fps and perhaps tracker, frames; ,init=800ms at the end of one that is not "
+        "measured says what the initialisation takes (default: as a frame)",
     )
     add("--time-unit", choices=("s", "ms", "us", "ns"), help="unit of measured times (default: s)")
     add("--repetition", type=int, default=1, metavar="K", help="take the K-th run (default: 1)")

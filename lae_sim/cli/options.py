@@ -27,7 +27,10 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
     """
     add = _world_group(parser, sweeps)
     add(
-        "--latency", default="recorded", help="where processing times come from (default: recorded)"
+        "--latency",
+        default="recorded",
+        help="where processing times come from (default: recorded); constant:47ms,init=800ms "
+        "tells the initialisation apart",
     )
     add(
         "--latency-scale",
@@ -43,9 +46,36 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
         nargs="+",
         default=[],
         metavar="TRACE",
-        help="passes on every N-th frame (lae-sim profile --stride): each sequence's boxes come "
-        "from the pass that is nearest to the frames skipped; and gap passes (--gaps)",
+        help="further passes of the tracker: on every N-th frame (lae-sim profile --stride; each "
+        "sequence's boxes come from the one nearest to the frames skipped), and gap passes "
+        "(--gaps), which say how far it reaches",
     )
+
+
+def add_search(parser: argparse.ArgumentParser, pre_forecaster: bool = True) -> None:
+    """Add what the search model takes: how far the tracker reaches, and from where.
+
+    Args:
+        parser: the command line.
+        pre_forecaster: whether it may say where the tracker searches.
+    """
+    add = parser.add_argument_group("the search model").add_argument
+    add(
+        "--search",
+        default="trace",
+        metavar="C",
+        help="how far the tracker finds its target: c=0.7 search sides, a range c=0.6-1.0, what "
+        "the traces know (trace, the default), or no search model (off)",
+    )
+    if not pre_forecaster:
+        return
+    add(
+        "--pre-forecaster",
+        metavar="NAME",
+        help="a forecaster that says where the tracker searches, such as kalman: what it is worth "
+        "is the search model's",
+    )
+    add("--keep-size", action="store_true", help="the pre-forecaster says the centre only")
 
 
 def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> None:
@@ -61,7 +91,8 @@ def add_worlds(parser: argparse.ArgumentParser, scales: Sequence[Fraction]) -> N
         nargs="+",
         default=["recorded"],
         metavar="SOURCE",
-        help="processing times, one after another: recorded, constant:47ms, ... as in replay",
+        help="processing times, one after another: recorded, constant:47ms,init=800ms, ... as in "
+        "replay",
     )
     add(
         "--latency-scale",
@@ -198,5 +229,8 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
         scale=arguments.latency_scale,
         timing=getattr(arguments, "timing", None),
         passes=getattr(arguments, "strided", ()),
+        search=getattr(arguments, "search", "off"),
+        pre_forecaster=getattr(arguments, "pre_forecaster", None),
+        keep_size=getattr(arguments, "keep_size", False),
         **scores,
     )

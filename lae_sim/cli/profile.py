@@ -31,6 +31,7 @@ examples:
   lae-sim profile --mode real-time --pre-forecaster kalman --timing jetson.parquet
   lae-sim profile --closed-loop constant:47ms constant:100ms --stride 3/2 2 3  then lae-sim fidelity
   lae-sim profile --gaps 10m --stride 2                how far it finds a target from where it was
+  lae-sim profile --closed-loop constant:47ms,init=1s --stride 3/2 2 3         then lae-sim fidelity
 
 trackers:
   dcf                     a correlation filter, no weights needed
@@ -120,7 +121,8 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--timing",
         metavar="TRACE|constant:47ms",
-        help="real-time: the schedule follows these times instead of the measured ones",
+        help="real-time: the schedule follows these times instead of the measured ones; "
+        ",init=800ms at their end says what the initialisation takes",
     )
     add(
         "--stride",

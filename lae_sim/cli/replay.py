@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import (
     add_forecasting,
+    add_search,
     add_world,
     argument,
     exit_status,
@@ -47,7 +48,8 @@ policies:     latest, fifo, every:N, shrinking-tail:TIME (expected processing ti
               vot-realtime[:GRACE] (the VOT toolkit's rule: it skips frames, never scores latency)
               or your own, package.module:object
 latencies:    recorded, by-call, constant:TIME, resample:SEED, lognormal:SEED,
-              bootstrap:SEED[:BLOCK], or your own, package.module:object
+              bootstrap:SEED[:BLOCK], or your own, package.module:object; each may end in
+              ,init=TIME, what the initialisation takes: constant:47ms,init=800ms
 conventions:  pysot, elae, otb, got10k, got10k-101, exclude
 """
 
@@ -62,6 +64,7 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add_world(made, sweeps=True)
+    add_search(made)
     scores = made.add_argument_group("forecasting and scores")
     add = scores.add_argument
     add(

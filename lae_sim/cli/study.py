@@ -29,6 +29,7 @@ conventions are crossed:
   fps = ["trace", 60]                    world frame rates; "trace" is each trace's own
   latencies = ["recorded", "bootstrap"]  also by-call, constant:47ms; bootstrap (in blocks),
                                          resample and lognormal are drawn anew in each repetition
+  init = ["300ms", "1s"]                 each with every latency: what the initialisation takes
   scales = [0.5, 1, 2]                   exact factors on all times; 2 is a device half as fast
   sigma = "grid"                         0, 0.02, ..., 1 (mAUC and mDP), or a list such as [0, 0.5]
   repetitions = 100                      of random latencies; seed = 0; block = 30 calls

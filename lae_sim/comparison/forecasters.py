@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from fractions import Fraction
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.caveats import notes_on
+from lae_sim.evaluation.caveats import left_search, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
 from lae_sim.evaluation.metrics import METRICS, find_convention
 from lae_sim.forecast.base import AnyFactory, Hold
@@ -18,6 +19,7 @@ from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.forecast.kalman import TunedKalman
 from lae_sim.learning.folds import Examples, Trainer, assign_folds, cross_fitted
 from lae_sim.replay.world import RECORDED, World, label_of
+from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
 
 if TYPE_CHECKING:
@@ -53,7 +55,8 @@ def score_forecasters(
         A row per trace, dataset, sequence, latency, scale, forecaster, sigma and metric, with its
         value in 0..1, NaN where the sequence leaves the mean. The scores of the tracker's own boxes
         at their own frames stand as the forecaster ``"offline"``. ``attrs["notes"]`` says what was
-        trained and which replays are approximations.
+        trained and which replays are approximations, ``attrs["init"]`` what initialisations cost in
+        each replay.
 
     Raises:
         LaeError: if there is no trace, the worlds differ in what they share, or whatever replaying,
@@ -67,21 +70,31 @@ def score_forecasters(
         raise LaeError("the worlds must share their permitted latencies, convention and costs")
     sigmas, convention = worlds[0].sigmas, find_convention(worlds[0].convention)
     ready, notes = fitted(traces, {"hold": Hold, **forecasters}, worlds, folds, seed, progress)
-    tables = []
+    tables, inits = [], []
     for label, trace in traces.items():
-        dataset = trace.metadata.dataset
+        dataset, about = trace.metadata.dataset, []
         for world in worlds:
-            runs = list(world.replay(trace))
+            replay = world.replay(trace)
+            runs = list(replay)
             progress(f"{label}, {world.label()}")
             costs = resolve_costs(world.costs, ready, [runs[0].recording])
             evaluation = evaluate_runs(runs, trace.metadata, ready, sigmas, convention, costs=costs)
             rows = _rows(evaluation, list(ready), sigmas)
             setting = {"latency": label_of(world.latency), "scale": float(world.scale)}
             tables.append(rows.assign(trace=label, dataset=dataset, **setting))
-            notes += _notes(f"{label}, {world.label()}", evaluation, costs)
-        about = notes_on(evaluation.replay, trace.metadata, convention, ready)
-        notes += [f"{label}: {note}" for note in about]
-    return _joined(tables, notes)
+            init = InitCost.of(evaluation.replay.init_ns, world.init_source(replay.times.metadata))
+            inits.append(
+                {
+                    "trace": label,
+                    **setting,
+                    **asdict(init),
+                    "left_search": left_search(evaluation.replay),
+                }
+            )
+            notes += _notes(f"{label}, {world.label()}", evaluation, costs, init)
+            about += notes_on(evaluation.replay, trace.metadata, convention, ready)
+        notes += [f"{label}: {note}" for note in dict.fromkeys(about)]
+    return _joined(tables, notes, inits)
 
 
 def fitted(
@@ -131,9 +144,9 @@ def steps(
     return trained * folds + len(traces) * len(worlds)
 
 
-def _notes(where: str, found: Evaluation, costs: Mapping[str, int]) -> list[str]:
+def _notes(where: str, found: Evaluation, costs: Mapping[str, int], init: InitCost) -> list[str]:
     """What keeps the figures of one replay from being what they seem."""
-    notes = []
+    notes = [f"{where}: {init}"]
     if share := found.replay.approximate_share:
         notes.append(
             f"{where}: approximate, {100 * share:.3g}% of the outputs follow another frame than "
@@ -157,11 +170,13 @@ def _rows(found: Evaluation, forecasters: Sequence[str], sigmas: Sequence[Fracti
     return pd.DataFrame({"value": np.stack(values).ravel()}, index).reset_index()
 
 
-def _joined(tables: Sequence[DataFrame], notes: Sequence[str]) -> DataFrame:
+def _joined(
+    tables: Sequence[DataFrame], notes: Sequence[str], inits: Sequence[Mapping[str, Any]]
+) -> DataFrame:
     """The tables as one, columns in order."""
     import pandas as pd
 
     columns = ["trace", "dataset", "sequence", "latency", "scale", "forecaster", "sigma"]
     joined = pd.concat(tables, ignore_index=True)[[*columns, "metric", "value"]]
-    joined.attrs["notes"] = list(notes)
+    joined.attrs |= {"notes": list(notes), "init": list(inits)}
     return joined

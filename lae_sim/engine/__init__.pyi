@@ -1,4 +1,13 @@
-from .clock import Clock, Number, duration_ns, exact, parse_duration, parse_fps, parse_rational
+from .clock import (
+    Clock,
+    Number,
+    duration_ns,
+    exact,
+    parse_duration,
+    parse_fps,
+    parse_rational,
+    split_init,
+)
 from .lanes import batchable, simulate_lanes
 from .policies import LanePolicy, every, fifo, latest, listed, shrinking_tail, vot_realtime
 from .scheduler import Call, Policy, Schedule, Service, scores_latency, simulate
@@ -27,5 +36,6 @@ __all__ = [
     "shrinking_tail",
     "simulate",
     "simulate_lanes",
+    "split_init",
     "vot_realtime",
 ]

@@ -113,6 +113,35 @@ def parse_budget(text: str) -> int:
     return int(budget)
 
 
+def split_init(text: str, path: bool = False) -> tuple[str, int | None]:
+    """Split the name of some times, such as ``"constant:47ms,init=800ms"``.
+
+    Args:
+        text: the name, which may end in ``,init=TIME``: what the initialisation takes.
+        path: whether the name is that of a file, which may hold commas of its own.
+
+    Returns:
+        The name alone, and the time of the initialisation, ns; None if it is not named.
+
+    Raises:
+        LaeError: if that is not a duration, or something else stands behind the comma.
+    """
+    name, _, value = text.rpartition(",init=") if ",init=" in text else (text, "", None)
+    if ",init=" in name:
+        raise LaeError(f"{text!r}: init stands twice")
+    if "," in name and not path:
+        rest = name.partition(",")[2]
+        raise LaeError(f"{text!r}: no {rest!r} here: after a comma comes init=TIME, as init=800ms")
+    if value is None:
+        return name, None
+    try:
+        return name, parse_duration(value)
+    except LaeError as error:
+        raise LaeError(f"{text!r}: init={value}: write a time of 0 or more, as init=800ms") from (
+            error
+        )
+
+
 def duration_ns(duration: str | None, ns: int | None) -> int:
     """A duration that is given as text with a unit, or as integer nanoseconds by name.
 

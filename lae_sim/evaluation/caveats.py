@@ -9,7 +9,7 @@ import numpy as np
 from lae_sim.evaluation.evaluate import ReplayStatistics, ScoredRun
 from lae_sim.evaluation.metrics import Convention
 from lae_sim.forecast.base import AnyFactory, notes_of
-from lae_sim.trace.describe import STALL
+from lae_sim.trace.describe import STALL, in_ms
 from lae_sim.trace.metadata import Metadata
 
 TRUSTED_DISAGREEMENT = 0.05
@@ -41,6 +41,11 @@ class SkippedStalls:
         ]
 
 
+def left_search(replay: ReplayStatistics) -> list[str]:
+    """The sequences whose target leaves the search region during the initialisation."""
+    return [name for name, left in zip(replay.sequences, replay.left_search) if left]
+
+
 def notes_on(
     replay: ReplayStatistics,
     metadata: Metadata,
@@ -70,6 +75,12 @@ def notes_on(
         notes.append(
             f"do not trust the replay of {len(parted)} of {len(sequences)} sequences, such as "
             f"{worst!r}: the passes disagree on more than {TRUSTED_DISAGREEMENT:.0%} of its frames"
+        )
+    if left := left_search(replay):
+        notes.append(
+            f"initialisation ({in_ms(replay.init_ns.mean() / 1e6)}) ends so late in {len(left)} of "
+            f"{len(sequences)} sequences that by the next frame the target has left the region "
+            f"which a tracker such as SiamFC searches around the initial box: {', '.join(left)}"
         )
     unknown = sum(metadata.image_size(name) is None for name in sequences)
     if unknown and "kalman-lae-pvt" in forecasters:

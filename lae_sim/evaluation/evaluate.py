@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
+from itertools import islice
 from typing import TypeAlias, TypeVar
 
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim.boxes import search_distance
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention
+from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_scores
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
-from lae_sim.evaluation.scoring import Scorer
+from lae_sim.evaluation.scoring import Scored, Scorer
 from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run
 from lae_sim.trace.file import Trace
@@ -43,6 +46,9 @@ class ReplayStatistics:
         departures: see :class:`lae_sim.replay.run.Run`, int64 [S].
         disagreement: see :class:`lae_sim.replay.run.Run`, float64 [S].
         init_ns: time of the initialisation, int64 [S].
+        left_search: whether the first frame after the initialisation comes so late that the target
+            has left the region which a tracker would search around the initial box (see
+            :func:`lae_sim.boxes.search_distance`), bool [S].
         calls_ns: total time of the other calls, int64 [S].
         calls_hz: sum of 1/elapsed over the other calls, per second, [S]; infinite if one took 0.
     """
@@ -56,6 +62,7 @@ class ReplayStatistics:
     departures: Ints
     disagreement: Floats
     init_ns: Ints
+    left_search: Bools
     calls_ns: Ints
     calls_hz: Floats
 
@@ -127,6 +134,7 @@ class Evaluation:
         offline: per metric, of the trace's boxes at their own frames, float64 [S]; NaN where the
             trace does not hold every frame.
         offline_curves: likewise, [S, ...].
+        modelled: the same under the search model.
     """
 
     replay: ReplayStatistics
@@ -136,6 +144,7 @@ class Evaluation:
     curves: Curves
     offline: Mapping[str, Floats]
     offline_curves: Curves
+    modelled: ModelledScores
 
     @classmethod
     def joined(cls, parts: Sequence[Evaluation]) -> Evaluation:
@@ -148,6 +157,7 @@ class Evaluation:
             curves=_joined([part.curves for part in parts], axis=1),
             offline={m: np.concatenate([p.offline[m] for p in parts]) for m in METRICS},
             offline_curves=_joined([part.offline_curves for part in parts]),
+            modelled=ModelledScores.joined([part.modelled for part in parts]),
         )
 
 
@@ -328,18 +338,11 @@ class _Scoring:
     def of(self, runs: Sequence[Run], offline: Sequence[_Offline]) -> Evaluation:
         """Score some runs at once."""
         schedules = [run.schedule for run in runs]
-        costs = {name: self.costs.get(name, 0) for name in self.forecasters}
-        pairings = {
-            cost: pair(schedules, self.sigmas, cost) for cost in sorted({0, *costs.values()})
-        }
-        scorer = Scorer([run.recording for run in runs], self.convention)
+        costs = {self.costs.get(name, 0) for name in self.forecasters}
+        pairings = {cost: pair(schedules, self.sigmas, cost) for cost in sorted({0, *costs})}
         kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs]
-        scored = []
-        for name, factory in self.forecasters.items():
-            pairing = pairings[costs[name]]
-            parts = _answers(runs, self.metadata, pairing, name, factory)
-            parts = self._observed(parts, pairing, name, kept)
-            scored.append(scorer.of(parts, len(self.sigmas), self.curves_at))
+        scored = self._scored(runs, pairings, kept)
+        scores = {m: np.stack([each.scores[m] for each in scored]) for m in METRICS}
         for place, run in enumerate(runs if self.observers else ()):
             one = ScoredRun(run, kept[place], place, self.sigmas, pairings)
             for observer in self.observers:
@@ -349,7 +352,7 @@ class _Scoring:
             staleness=Staleness(
                 pairings[0].mismatch_sum, pairings[0].mismatch_max, pairings[0].longest_hold
             ),
-            scores={m: np.stack([each.scores[m] for each in scored]) for m in METRICS},
+            scores=scores,
             failure=np.stack([each.failure for each in scored]),
             curves=Curves(
                 np.stack([each.success for each in scored]),
@@ -360,7 +363,49 @@ class _Scoring:
                 np.stack([each.success for each in offline]),
                 np.stack([each.precision for each in offline]),
             ),
+            modelled=self._modelled(runs, scores),
         )
+
+    def _scored(
+        self,
+        runs: Sequence[Run],
+        pairings: Mapping[int, Pairing],
+        kept: Sequence[dict[tuple[str, Fraction], Answers]],
+    ) -> list[Scored]:
+        """The scores of each forecaster."""
+        scorer = Scorer([run.recording for run in runs], self.convention)
+        scored = []
+        for name, factory in self.forecasters.items():
+            pairing = pairings[self.costs.get(name, 0)]
+            parts = _answers(runs, self.metadata, pairing, name, factory)
+            parts = self._observed(parts, pairing, name, kept)
+            scored.append(scorer.of(parts, len(self.sigmas), self.curves_at))
+        return scored
+
+    def _modelled(self, runs: Sequence[Run], recorded: Mapping[str, Floats]) -> ModelledScores:
+        """The scores under the search model; its outcomes are scored as runs are."""
+        scores: list[dict[str, Floats]] = []
+        others = []
+        for s, run in enumerate(runs):
+            boxes = () if run.modelled is None else run.modelled.boxes
+            scores.append(
+                {m: np.stack([recorded[m][:, s]] * len(boxes), 1) for m in MODELLED}
+                if boxes
+                else {}
+            )
+            for r, each in enumerate(boxes):
+                if not np.array_equal(each, run.boxes):
+                    others.append((s, r, replace(run, boxes=each)))
+        costs = {self.costs.get(name, 0) for name in self.forecasters}
+        unobserved, places = replace(self, observed=()), iter(others)
+        for group in batched([run for *_, run in others]):
+            schedules = [run.schedule for run in group]
+            pairings = {cost: pair(schedules, self.sigmas, cost) for cost in costs}
+            scored = unobserved._scored(group, pairings, [])
+            for i, (s, r, _) in enumerate(islice(places, len(group))):
+                for metric in MODELLED:
+                    scores[s][metric][:, r] = [each.scores[metric][i] for each in scored]
+        return modelled_scores(runs, recorded, scores)
 
     def _observed(
         self,
@@ -392,9 +437,22 @@ def _replay_statistics(
         departures=np.array([run.departures for run in runs], np.int64),
         disagreement=np.array([run.disagreement for run in runs]),
         init_ns=np.array([each[0] for each in elapsed], np.int64),
+        left_search=_left_search(runs),
         calls_ns=np.array([each[1:].sum() for each in elapsed], np.int64),
         calls_hz=np.array([_rates(each[1:]).sum() for each in elapsed]),
     )
+
+
+def _left_search(runs: Sequence[Run]) -> Bools:
+    """Whether the target leaves the search region during each initialisation, bool [S]."""
+    # of a run that processes nothing more, and of one that skips nothing, frame 0: no distance
+    resumed = [int(run.schedule.frames[1:2].sum()) for run in runs]
+    truth = [
+        run.recording.truth[[0, frame if frame > 1 else 0]] for run, frame in zip(runs, resumed)
+    ]
+    initial, then = np.array(truth).transpose(1, 0, 2)
+    left: Bools = search_distance(initial, then) >= 1
+    return left
 
 
 def _rates(elapsed_ns: Ints) -> Floats:

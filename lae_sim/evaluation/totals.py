@@ -14,6 +14,7 @@ import numpy as np
 from lae_sim._arrays import Floats, Ints
 from lae_sim.evaluation.evaluate import Curves, Evaluation, ReplayStatistics, Staleness
 from lae_sim.evaluation.metrics import METRICS
+from lae_sim.evaluation.modelled import MODELLED, interval, summed
 
 RECOVERED = ("auc", "dp20")
 """The metrics of which a share of the latency loss can be recovered."""
@@ -136,11 +137,70 @@ class CurveTotals:
         return Curves(success.value, precision.value)
 
 
+class ModelledTotals:
+    """Scores under the search model, added up over sequences.
+
+    Attributes:
+        known: see :class:`.modelled.ModelledScores`.
+        applies: number of sequences whose replay is not exact.
+    """
+
+    def __init__(self, hold: int) -> None:
+        """With the index of the forecaster that others are to do better than."""
+        self.known: bool | None = None
+        self.applies = 0
+        self._unexplained: Mapping[str, float] = {}
+        self._hold = hold
+        self._draws: dict[str, list[Floats]] = {metric: [] for metric in MODELLED}
+        self._scores = {metric: Mean() for metric in MODELLED}
+        self._won = {metric: Mean() for metric in MODELLED}
+        self._lost = {metric: Mean() for metric in MODELLED}
+        self._outputs = self._lost_outputs = 0.0
+
+    def add(self, part: Evaluation) -> None:
+        """Add the sequences of a part."""
+        modelled, outputs = part.modelled, part.replay.processed
+        if self.known is None:
+            self.known, self._unexplained = modelled.known, modelled.unexplained
+        self.applies += int(modelled.applies.sum())
+        self._outputs += float(outputs.sum())
+        self._lost_outputs += float(modelled.lost_share @ outputs)
+        for metric in MODELLED:
+            so_far = self._draws[metric]
+            self._draws[metric] = [summed([*so_far, modelled.draws[metric]])]
+            scores = modelled.mean[metric].transpose(0, 2, 1)
+            hold = scores[self._hold]
+            self._scores[metric].add(scores)
+            won, lost = scores - hold, np.broadcast_to(part.offline[metric] - hold, scores.shape)
+            counted = ~np.isnan(won + lost)
+            self._won[metric].add(np.where(counted, won, np.nan))
+            self._lost[metric].add(np.where(counted, lost, np.nan))
+
+    @property
+    def lost_share(self) -> float:
+        """Share of the outputs answered while the target is lost, 0..1."""
+        return self._lost_outputs / self._outputs if self._outputs else 0.0
+
+    def mean(self, metric: str) -> Floats:
+        """Mean scores, float64 [F, M]."""
+        return self._scores[metric].value
+
+    def interval(self, metric: str) -> tuple[Floats, Floats]:
+        """The low and the high end of the mean scores, each float64 [F, M]."""
+        (draws,) = self._draws[metric]
+        return interval(draws, bool(self.known), self._unexplained[metric], self.applies)
+
+    def recovered(self, metric: str) -> tuple[Floats, Floats]:
+        """How much better than hold, and how much better the offline scores are, [F, M] each."""
+        return self._won[metric].total, self._lost[metric].total
+
+
 class Totals:
     """All that is said of a trace as a whole.
 
     Attributes:
         scores: over all sequences.
+        modelled: the same under the search model.
         by_attribute: over those of each attribute.
         curves: over all sequences.
     """
@@ -149,6 +209,7 @@ class Totals:
         """With the index of the forecaster that others are to do better than."""
         self.scores = ScoreTotals(hold)
         self.by_attribute: dict[str, ScoreTotals] = {}
+        self.modelled = ModelledTotals(hold)
         self.curves = CurveTotals()
         self._hold = hold
         self._replays: list[ReplayStatistics] = []
@@ -157,6 +218,7 @@ class Totals:
     def add(self, part: Evaluation, members: Mapping[str, Sequence[int]] | None = None) -> None:
         """Add a group, with the indices of its sequences of each attribute."""
         self.scores.add(part)
+        self.modelled.add(part)
         self.curves.add(part)
         for name, which in (members or {}).items():
             self.by_attribute.setdefault(name, ScoreTotals(self._hold)).add(part, which)

@@ -263,7 +263,10 @@ def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | No
     """Processing time of each frame, int64 [n], ns."""
     count = len(results.boxes)
     if given:
-        return np.full(count, given.of(name, count), np.int64)
+        times = np.full(count, given.of(name, count), np.int64)
+        if given.init_ns is not None:
+            times[:1] = given.init_ns
+        return times
     if results.elapsed_ns is not None:
         if len(results.elapsed_ns) != count:
             raise LaeError(

@@ -20,7 +20,7 @@ import numpy as np
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.numbers import read_durations, read_numbers
-from lae_sim.engine.clock import parse_duration, parse_fps
+from lae_sim.engine.clock import parse_duration, parse_fps, split_init
 from lae_sim.errors import LaeError
 from lae_sim.importers.matlab import load_matlab
 
@@ -72,11 +72,13 @@ class GivenTimes:
         source: what the trace says of them.
         constant_ns: one time for all, or None.
         per_sequence: frames (if stated) and time in ns of each sequence.
+        init_ns: the time of the initialisation, if it is not that of a frame.
     """
 
     source: str
     constant_ns: int | None
     per_sequence: Mapping[str, tuple[int | None, int]]
+    init_ns: int | None = None
 
     def of(self, sequence: str, frames: int) -> int:
         """The time of every frame of a sequence of ``frames`` frames, ns.
@@ -101,25 +103,30 @@ def given_times(text: str, tracker: str) -> GivenTimes | None:
 
     Args:
         text: ``measured``, ``constant:47ms``, ``mean-fps:120`` or ``mean-fps:FILE.csv`` (columns
-            sequence, fps and perhaps tracker, frames).
+            sequence, fps and perhaps tracker, frames); all but the first may end in
+            ``,init=800ms``, what the initialisation takes.
         tracker: whose rows to take where the file has several trackers.
 
     Raises:
         LaeError: if there is no such name, or the file lacks the tracker or a column.
     """
-    name, _, value = text.partition(":") if isinstance(text, str) else (None, "", "")
     if text == "measured":
         return None
+    name = text.partition(":")[0] if isinstance(text, str) else None
+    if name not in ("constant", "mean-fps"):
+        raise LaeError(f"time: no {text!r:.40}: use the measured ones, or {NO_TIMES}")
+    times, init_ns = split_init(text, path=name == "mean-fps")
+    _, _, value = times.partition(":")
+    init = "" if init_ns is None else f", initialisation {init_ns / 1e6:g} ms"
     if name == "constant":
         amount = re.sub(r"(?<=\d)(?=[a-z])", " ", value)
-        return GivenTimes(f"constant {amount}, not measured", parse_duration(value), {})
-    if name != "mean-fps":
-        raise LaeError(f"time: no {text!r:.40}: use the measured ones, or {NO_TIMES}")
+        source = f"constant {amount}{init}, not measured"
+        return GivenTimes(source, parse_duration(value), {}, init_ns)
     if not value.lower().endswith(".csv"):
-        source = f"mean fps {value} given, not measured per frame"
-        return GivenTimes(source, frame_ns(parse_fps(value)), {})
-    source = f"mean fps of each sequence from {Path(value).name}, not measured per frame"
-    return GivenTimes(source, None, dict(_mean_fps_rows(Path(value), tracker)))
+        source = f"mean fps {value} given{init}, not measured per frame"
+        return GivenTimes(source, frame_ns(parse_fps(value)), {}, init_ns)
+    source = f"mean fps of each sequence from {Path(value).name}{init}, not measured per frame"
+    return GivenTimes(source, None, dict(_mean_fps_rows(Path(value), tracker)), init_ns)
 
 
 def frame_ns(fps: Fraction) -> int:

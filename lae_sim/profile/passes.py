@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from lae_sim.datasets.frames import Buffered, Dataset, ImageSequence
-from lae_sim.engine.clock import Clock, parse_duration
+from lae_sim.engine.clock import Clock, parse_duration, split_init
 from lae_sim.engine.scheduler import Service
 from lae_sim.errors import LaeError
 from lae_sim.profile.device import describe_device, readings, source_version
 from lae_sim.profile.journal import Journal
 from lae_sim.profile.live import Live, LiveRun
 from lae_sim.profile.timed import TimedTracker, TrackerError
-from lae_sim.replay.latency import by_frame
+from lae_sim.replay.latency import by_frame, initialised
 from lae_sim.trace.file import Trace, read_trace, write_trace
 from lae_sim.trace.metadata import FORMAT, Metadata, version_of
 from lae_sim.trace.recording import Recording
@@ -96,31 +96,49 @@ class Pass:
 def parse_timing(text: str) -> tuple[str, Timing]:
     """Times of another device: ``constant:47ms``, or a trace's by frame.
 
+    Both may end in ``,init=800ms``, what the initialisation takes.
+
     Returns:
         What a trace says of such times, and the times.
 
     Raises:
         LaeError: if the text is neither, or the trace cannot be read.
     """
-    kind, _, value = text.partition(":")
+    path, init_ns = split_timing(text)
+    kind, _, value = path.partition(":")
+    init = "" if init_ns is None else f", initialisation {init_ns / 1e6:g} ms"
     if kind == "constant":
         elapsed_ns = parse_duration(value)
-        return f"constant {value}, not measured", lambda sequence: lambda frame: elapsed_ns
-    trace = read_trace(text)
+        first_ns = elapsed_ns if init_ns is None else init_ns
+        return (
+            f"constant {value}{init}, not measured",
+            lambda sequence: lambda frame: elapsed_ns if frame else first_ns,
+        )
+    trace = read_trace(path)
+    source = by_frame if init_ns is None else initialised(by_frame, init_ns)
     recordings = {recording.name: recording for recording in trace}
 
     def timing(sequence: ImageSequence) -> Service:
         recording = recordings.get(sequence.name)
         if recording is None:
-            raise LaeError(f"{text}: has no times of sequence {sequence.name!r}")
+            raise LaeError(f"{path}: has no times of sequence {sequence.name!r}")
         if len(recording) != len(sequence):
             raise LaeError(
-                f"{text}: has {len(recording)} frames of sequence {sequence.name!r}, which has "
+                f"{path}: has {len(recording)} frames of sequence {sequence.name!r}, which has "
                 f"{len(sequence)} here"
             )
-        return by_frame(recording)
+        return source(recording)
 
-    return f"{Path(text).name} ({trace.metadata.device}), not measured here", timing
+    return f"{Path(path).name} ({trace.metadata.device}){init}, not measured here", timing
+
+
+def split_timing(text: str) -> tuple[str, int | None]:
+    """Split times of another device into their name and the time of the initialisation, if any.
+
+    Raises:
+        LaeError: if that is not a duration.
+    """
+    return split_init(text, path=not text.startswith("constant:"))
 
 
 def base_document(

@@ -42,6 +42,7 @@ from lae_sim.profile.passes import (
     parse_timing,
     run_pass,
     scheduled,
+    split_timing,
     summary,
     warm_up,
     write_pass,
@@ -50,6 +51,7 @@ from lae_sim.profile.timed import TimedTracker
 from lae_sim.profile.translation import Translated
 from lae_sim.profile.worker import InProcess, Worker
 from lae_sim.progress import ProgressBar
+from lae_sim.replay.latency import time_label
 from lae_sim.replay.strides import phases
 from lae_sim.replay.world import flag, named, parse_policy, several, text
 from lae_sim.trace.file import read_trace
@@ -371,11 +373,12 @@ def _policy(value: Any) -> str:
 
 def _timing(value: Any) -> str:
     """Times as of :func:`.passes.parse_timing`, looked at before the tracker is started."""
-    kind, _, elapsed = _path(value).partition(":")
+    name, _ = split_timing(_path(value))
+    kind, _, elapsed = name.partition(":")
     if kind == "constant":
         parse_duration(elapsed)
     else:
-        read_trace(_path(value))
+        read_trace(name)
     return _path(value)
 
 
@@ -525,13 +528,14 @@ def _passes(
         real_time(f"closed-loop-{_short(timing)}", timing)
         for timing in dict.fromkeys(plan.closed_loops)
     ]
-    times = [timing for timing in (plan.timing, *plan.closed_loops) if timing]
-    traces = [timing for timing in times if not timing.startswith("constant:")]
+    times = [split_timing(timing)[0] for timing in (plan.timing, *plan.closed_loops) if timing]
+    traces = [name for name in times if not name.startswith("constant:")]
     check_distinct([each.path for each in passes], traces)
     return passes
 
 
 def _short(timing: str) -> str:
     """What tells a closed loop's trace from others."""
-    constant = timing.startswith("constant:")
-    return timing.removeprefix("constant:") if constant else Path(timing).stem
+    name, init_ns = split_timing(timing)
+    short = name.removeprefix("constant:") if name.startswith("constant:") else Path(name).stem
+    return short if init_ns is None else f"{short}-init-{time_label(init_ns)}"

@@ -6,7 +6,8 @@ at once (:mod:`lae_sim.engine.lanes`). Random sources draw from one stream per s
 the seed and the sequence's name, so the order and the number of sequences never change a result.
 Streams are raw 64-bit words of PCG64 and the arithmetic on them is ours, so that they are the same
 under every NumPy version; the lognormal one also rests on the platform's exp and log, whose last
-bit may differ before rounding to ns.
+bit may differ before rounding to ns. Initialisation is a call of its own kind: any source may be
+given a time for it (:func:`initialised`).
 """
 
 from __future__ import annotations
@@ -47,32 +48,55 @@ def by_call(recording: Recording) -> Times:
     return Times(recording.name, _recorded(recording), by_call=True)
 
 
-def constant(elapsed: str | None = None, *, ns: int | None = None) -> LatencySource:
-    """Every call takes the same time, the initialisation too.
+def constant(
+    elapsed: str | None = None,
+    *,
+    ns: int | None = None,
+    init: str | None = None,
+    init_ns: int | None = None,
+) -> LatencySource:
+    """Every call takes the same time; the initialisation too, unless it has one of its own.
 
     Args:
         elapsed: the time with its unit, such as ``"47ms"``.
         ns: the same in nanoseconds.
+        init: what the initialisation takes, such as ``"800ms"``.
+        init_ns: the same in nanoseconds.
 
     Raises:
-        LaeError: if it is not a duration, or below zero.
+        LaeError: if one is not a duration, or below zero.
     """
-    return _Constant(duration_ns(elapsed, ns))
+    source = Constant(duration_ns(elapsed, ns))
+    if init is None and init_ns is None:
+        return source
+    return initialised(source, duration_ns(init, init_ns))
 
 
 @dataclass(frozen=True)
-class _Constant:
+class Constant:
+    """One time for every call.
+
+    Attributes:
+        ns: the time.
+    """
+
     ns: int
 
     @property
     def label(self) -> str:
         """The name of the source in tables."""
-        ms = Fraction(self.ns, 10**6)
-        return f"constant:{ms}ms" if ms.denominator == 1 else f"constant:{self.ns}ns"
+        return f"constant:{time_label(self.ns)}"
 
     def __call__(self, recording: Recording) -> Times:
+        """The times of a recording."""
         time = np.array(min(self.ns, MAX_INT64), np.int64)
         return Times(recording.name, np.broadcast_to(time, len(recording)), by_call=True)
+
+
+def time_label(ns: int) -> str:
+    """A time as the names of sources have it."""
+    ms = Fraction(ns, 10**6)
+    return f"{ms}ms" if ms.denominator == 1 else f"{ns}ns"
 
 
 @dataclass(frozen=True)
@@ -85,12 +109,15 @@ class RandomSource:
             unless there is no other) and of uniform words, uint64 [R, n].
         repetition: which part of a sequence's stream is used: T words each, the last one idle.
         factors: exact factors on the times, one after another.
+        init_ns: the time of the initialisation, if it does not keep its recorded one; the factors
+            are in it.
     """
 
     seed: int
     draw: Callable[[Ints, Words], npt.ArrayLike]
     repetition: int = 0
     factors: tuple[Fraction, ...] = ()
+    init_ns: int | None = None
 
     def __call__(self, recording: Recording) -> Times:
         """The times of this repetition."""
@@ -108,6 +135,8 @@ class RandomSource:
         times[:, 1:] = self.draw(recorded[1:] if len(recorded) > 1 else recorded, words[:, :-1])
         for factor in self.factors:
             times = _times(factor, times)
+        if self.init_ns is not None:
+            times[:, 0] = self.init_ns
         return times
 
 
@@ -189,7 +218,10 @@ def scaled(source: LatencySource, factor: Fraction) -> LatencySource:
     if factor == 1:
         return source
     if isinstance(source, RandomSource):
-        return replace(source, factors=(*source.factors, factor))
+        init_ns = source.init_ns
+        if init_ns is not None:
+            init_ns = int(_times(factor, np.array([init_ns]))[0])
+        return replace(source, factors=(*source.factors, factor), init_ns=init_ns)
 
     def scaled_source(recording: Recording) -> Service:
         service = source(recording)
@@ -198,6 +230,51 @@ def scaled(source: LatencySource, factor: Fraction) -> LatencySource:
         return lambda frame: round(index(service(frame)) * factor)
 
     return scaled_source
+
+
+def initialised(source: LatencySource, ns: int) -> LatencySource:
+    """The times of another source, but for that of the initialisation, the call on frame 0.
+
+    The other calls take what they would have taken: by call, the second takes the second time.
+
+    Args:
+        source: of all times. To scale it afterwards scales the initialisation too.
+        ns: what the initialisation takes.
+
+    Raises:
+        LaeError: if the time is below zero.
+    """
+    ns = min(duration_ns(None, ns), MAX_INT64)
+    if isinstance(source, RandomSource):
+        return replace(source, init_ns=ns)
+    return Initialised(source, ns)
+
+
+@dataclass(frozen=True)
+class Initialised:
+    """A source whose initialisation has a time of its own.
+
+    Attributes:
+        source: of the other times.
+        init_ns: the time.
+    """
+
+    source: LatencySource
+    init_ns: int
+
+    def __call__(self, recording: Recording) -> Service:
+        """The times of a recording."""
+        service = self.source(recording)
+        if isinstance(service, Times):
+            ns = service.ns.copy()
+            ns[0] = self.init_ns
+            return replace(service, ns=ns)
+
+        def initialised_service(frame: int) -> int:
+            ns = service(frame)  # asked for frame 0 too: it may count its calls
+            return ns if frame else self.init_ns
+
+        return initialised_service
 
 
 def _times(factor: Fraction, ns: Ints) -> Ints:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 
@@ -17,13 +17,16 @@ from lae_sim.engine.policies import latest
 from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
 from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError, explained, shown
+from lae_sim.forecast.base import ImageSize
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
 from lae_sim.replay.reach import split_passes
+from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
 from lae_sim.trace.recording import Recording, batched
 
 _GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
+_LEAST = 0.2  # weight of the farther of two strides beside a step
 _LANE_FRAMES = 1 << 21  # and of their repetitions
 
 
@@ -42,6 +45,7 @@ class Run:
         disagreement: share of processed frames where the box of the next lower or next higher
             stride overlaps less than half, 0 if the replay is exact, NaN without strided passes.
             Where it is high the tracker's luck depends on the frames that it sees.
+        modelled: what the search model makes of the run; None where it is off, or the replay exact.
 
     Example:
         >>> import lae_sim
@@ -58,6 +62,7 @@ class Run:
     boxes: Floats
     departures: int
     disagreement: float = np.nan
+    modelled: Outcomes | None = None
 
     def __len__(self) -> int:
         """Number of world frames T."""
@@ -76,6 +81,8 @@ def replay_sequence(
     times: Recording | None = None,
     stride: Fraction = Fraction(1),
     strided: Mapping[Fraction, Recording] | None = None,
+    search: SearchModel | None = None,
+    image_size: ImageSize = None,
 ) -> Run:
     """Replay a recording under a latency source and a policy.
 
@@ -88,6 +95,8 @@ def replay_sequence(
         stride: that of the recording, if it holds every frame (see :mod:`lae_sim.replay.strides`).
         strided: recordings of every frame at other strides. The boxes are taken from the pass whose
             stride is nearest to the mean number of frames from one output to the next.
+        search: the model of where the tracker finds its target; None for none.
+        image_size: width and height in pixels, if known, for the model's pre-forecaster.
 
     Raises:
         LaeError: if a frame is asked for that the recording lacks, or the recordings differ in
@@ -105,7 +114,8 @@ def replay_sequence(
         raise LaeError(f"recording: one sequence, such as trace['car'], not {shown(recording)}")
     if not isinstance(clock, Clock):
         raise LaeError(f"clock: such as Clock.at(trace.metadata.fps), not {shown(clock)}")
-    job = _Job(recording, recording if times is None else times, strided or {}, stride)
+    times = recording if times is None else times
+    job = _Job(recording, times, strided or {}, stride, search, image_size)
     return job.run(simulate(len(recording), clock, source(job.times), policy))
 
 
@@ -117,6 +127,8 @@ class _Job:
     times: Recording
     passes: Mapping[Fraction, Recording]
     stride: Fraction
+    search: SearchModel | None = None
+    image_size: ImageSize = None
 
     def __post_init__(self) -> None:
         for other in (self.times, *self.passes.values()):
@@ -130,11 +142,30 @@ class _Job:
         return len(self.recording)
 
     def run(self, schedule: Schedule) -> Run:
-        recording, frames = self.recording, schedule.frames
+        frames = schedule.frames
+        passes = {self.stride: self.recording, **self.passes}
+        strides = sorted(passes)
+        nearest = _nearest(strides, frames)
+        stride = strides[nearest]
+        boxes = _boxes(passes[stride], frames)
+        before = self.before if stride == self.stride else _before(passes[stride], stride)
+        departures = _departures(before, frames)
+        disagreement = np.nan
         if self.passes:
-            return _from_passes(recording, {self.stride: recording, **self.passes}, schedule)
-        departures = _departures(self.before, frames)
-        return Run(recording, schedule, _boxes(recording, frames), departures)
+            parted = np.zeros(len(frames), bool)
+            for other in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
+                parted |= iou(_boxes(passes[other], frames), boxes) < PARTED_IOU
+            disagreement = float(parted.mean())
+        run = Run(self.recording, schedule, boxes, departures, disagreement)
+        if self.search is None or not (departures or self.search.pre_forecaster is not None):
+            return run
+        farther = np.append(False, np.diff(frames) > (frames - before.take(frames))[1:])
+        recorded = [RecordedAnswers(boxes, farther)]
+        if self.passes:
+            for other, weight in _beside(strides, frames).items():
+                recorded += phase_answers(other, passes[other], frames, weight)
+        modelled = self.search.outcomes(self.recording, frames, recorded, self.image_size)
+        return replace(run, modelled=modelled)
 
     @cached_property
     def before(self) -> Ints:
@@ -167,21 +198,27 @@ def _departures(before: Ints, frames: Ints) -> int:
     return int(np.count_nonzero(before.take(frames[1:]) != frames[:-1]))
 
 
-def _from_passes(
-    recording: Recording, passes: Mapping[Fraction, Recording], schedule: Schedule
-) -> Run:
-    """The run whose boxes come from the pass that is nearest to its mean step."""
-    frames = schedule.frames
+def _nearest(strides: Sequence[Fraction], frames: Ints) -> int:
+    """The stride nearest to the mean step of some processed frames, by its place."""
     step = Fraction(int(frames[-1]), max(len(frames) - 1, 1))
-    strides = sorted(passes)
-    nearest = min(range(len(strides)), key=lambda k: abs(strides[k] - step))
-    source = passes[strides[nearest]]
-    boxes = _boxes(source, frames)
-    departures = _departures(_before(source, strides[nearest]), frames)
-    parted = np.zeros(len(frames), bool)
-    for stride in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
-        parted |= iou(_boxes(passes[stride], frames), boxes) < PARTED_IOU
-    return Run(recording, schedule, boxes, departures, float(parted.mean()))
+    return min(range(len(strides)), key=lambda k: abs(strides[k] - step))
+
+
+def _beside(strides: Sequence[Fraction], frames: Ints) -> dict[Fraction, float]:
+    """The strides next below and above the mean step of some processed frames, with weights.
+
+    The nearer one weighs more; both weigh something, since steps differ from each other. The step
+    from the initialisation does not count: a long one says nothing of those after it.
+    """
+    after = frames[1:] if len(frames) > 2 else frames
+    step = Fraction(int(after[-1] - after[0]), max(len(after) - 1, 1))
+    below = max((stride for stride in strides if stride <= step), default=strides[0])
+    above = min((stride for stride in strides if stride >= step), default=strides[-1])
+    if below == above:
+        return {below: 1.0}
+    share = float((step - below) / (above - below))
+    share = min(max(share, _LEAST), 1 - _LEAST)
+    return {below: 1 - share, above: share}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -198,6 +235,7 @@ class Runs:
             :func:`replay_sequence`), and gap passes.
         batch: schedule many sequences at once where source and policy allow it (see
             :func:`lae_sim.engine.lanes.batchable`). The runs are the same, and come in groups.
+        search: the model of where the tracker finds its target; None for none.
 
     Raises:
         LaeError: if two passes have the same stride, or the trace is a gap pass; while one goes
@@ -220,6 +258,7 @@ class Runs:
     timing: Trace | None = None
     passes: tuple[Trace, ...] = ()
     batch: bool = False
+    search: SearchModel | None = None
 
     def __post_init__(self) -> None:
         if self.trace.metadata.kind == "restarts":
@@ -236,9 +275,19 @@ class Runs:
         """The passes at other strides."""
         return split_passes(self.passes)[0]
 
+    @property
+    def gap_passes(self) -> tuple[Trace, ...]:
+        """The passes that measure how far the tracker reaches."""
+        return split_passes(self.passes)[1]
+
+    @property
+    def times(self) -> Trace:
+        """The trace that the times are taken from."""
+        return self.trace if self.timing is None else self.timing
+
     def __iter__(self) -> Iterator[Run]:
         frames = _GROUP_FRAMES if self.batch else 1
-        for jobs in batched(_jobs(self.trace, self.timing, self.strided), frames):
+        for jobs in batched(_jobs(self.trace, self.timing, self.strided, self.search), frames):
             with explained("latency"):
                 services = [self.source(job.times) for job in jobs]
             yield from _replayed(jobs, self.clock, services, self.policy)
@@ -268,7 +317,7 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
     source = runs.source
     if not isinstance(source, RandomSource) or runs.strided:
         raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
-    for jobs in batched(_jobs(runs.trace, runs.timing), _GROUP_FRAMES):
+    for jobs in batched(_jobs(runs.trace, runs.timing, (), runs.search), _GROUP_FRAMES):
         size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
         for begin in range(first, first + count, size):
             some = range(begin, min(begin + size, first + count))
@@ -292,7 +341,9 @@ def _replayed(
         yield job.run(schedule)
 
 
-def _jobs(trace: Trace, timing: Trace | None, strided: Sequence[Trace] = ()) -> Iterator[_Job]:
+def _jobs(
+    trace: Trace, timing: Trace | None, strided: Sequence[Trace], search: SearchModel | None
+) -> Iterator[_Job]:
     """Each recording of a trace with those of the same name in other traces."""
     times = None if timing is None else _finder(timing, "the trace of the times")
     passes = {
@@ -306,6 +357,8 @@ def _jobs(trace: Trace, timing: Trace | None, strided: Sequence[Trace] = ()) -> 
             recording if times is None else times(recording.name),
             {other: find(recording.name) for other, find in passes.items()},
             stride,
+            search,
+            trace.metadata.image_size(recording.name),
         )
 
 

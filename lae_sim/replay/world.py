@@ -6,6 +6,7 @@ Command lines, study files and keyword arguments all make worlds, through the pa
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -13,16 +14,28 @@ from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
 from lae_sim.engine import policies
-from lae_sim.engine.clock import Clock, Number, exact, parse_fps, whole
+from lae_sim.engine.clock import Clock, Number, exact, parse_fps, split_init, whole
 from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError, hint, shown
 from lae_sim.files import sequence_names
+from lae_sim.forecast.base import AnyFactory
 from lae_sim.plugins import bound, imported
 from lae_sim.replay import latency as sources
-from lae_sim.replay.latency import LatencySource, scaled
+from lae_sim.replay.latency import (
+    Constant,
+    Initialised,
+    LatencySource,
+    RandomSource,
+    initialised,
+    scaled,
+    time_label,
+)
 from lae_sim.replay.reach import split_passes
 from lae_sim.replay.run import Runs
+from lae_sim.replay.search import find_search, parse_search
+from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
 from lae_sim.trace.file import Trace, read_trace
+from lae_sim.trace.metadata import Metadata
 
 SIGMA_GRID = tuple(Fraction(m, 50) for m in range(51))
 """The permitted latencies that PVT++ averages over: 0, 0.02, ..., 1 frames.
@@ -75,6 +88,11 @@ class World:
         timing: another device's trace of the same sequences, to take the times from.
         passes: traces of the same tracker at other strides, one of which each sequence's boxes
             come from (see :func:`lae_sim.replay.run.replay_sequence`), and gap passes.
+        search: what is assumed of how far the tracker finds its target, by name (see
+            :func:`lae_sim.replay.search.parse_search`).
+        pre_forecaster: name of the forecaster that says where the tracker searches, in the search
+            model; None where that is its last answer.
+        keep_size: whether it says the centre only.
         sigmas: permitted latencies in frames, ascending.
         convention: how frames and thresholds count, by name.
         forecasters: names.
@@ -99,6 +117,9 @@ class World:
     scale: Fraction = Fraction(1)
     timing: TraceLike | None = None
     passes: tuple[TraceLike, ...] = ()
+    search: str = "trace"
+    pre_forecaster: str | None = None
+    keep_size: bool = False
     sigmas: tuple[Fraction, ...] = (Fraction(0),)
     convention: str = "pysot"
     forecasters: tuple[str, ...] = ("hold",)
@@ -118,6 +139,13 @@ class World:
         _check_kinds("latency", [self.latency], _PLUGIN, latency)
         traces = [*self.passes] if self.timing is None else [self.timing, *self.passes]
         _check_kinds("timing and passes", traces, _TRACE, _A_TRACE)
+        named("search", parse_search, text(self.search))
+        if self.pre_forecaster is not None and self.search == "off":
+            raise LaeError(
+                "pre_forecaster: what it is worth is the search model's: do not turn it off"
+            )
+        if self.keep_size and self.pre_forecaster is None:
+            raise LaeError("keep_size is a way to use a pre_forecaster")
         _check_kinds("convention", [self.convention], (str,), "a name, such as 'pysot'")
         _check_kinds("forecasters", self.forecasters, (str,), "a name, such as 'kalman'")
         _check_kinds("costs", self.costs, (str,), "text, such as '2ms' or 'kalman=2ms'")
@@ -147,6 +175,9 @@ class World:
         scale: Number = 1,
         timing: TraceLike | None = None,
         passes: TraceLike | Iterable[TraceLike] = (),
+        search: str = "trace",
+        pre_forecaster: str | None = None,
+        keep_size: bool = False,
         sigma: Number | Iterable[Number] = 0,
         convention: str = "pysot",
         forecasters: str | Iterable[str] = ("hold",),
@@ -167,6 +198,9 @@ class World:
             scale=named("scale", _factor, scale),
             timing=timing,
             passes=several(passes),
+            search=search,
+            pre_forecaster=pre_forecaster,
+            keep_size=keep_size,
             sigmas=named("sigma", parse_sigmas, sigma),
             convention=convention,
             forecasters=tuple(dict.fromkeys(several(forecasters))),
@@ -227,8 +261,34 @@ class World:
         name = label_of(self.latency)
         return name if self.scale == 1 else f"{name} x {self.scale}"
 
+    @property
+    def times_kind(self) -> str:
+        """What kind of times these are, such as ``"recorded"`` or ``"constant"``."""
+        return kind_of(label_of(self.latency))
+
+    def init_source(self, times: Metadata) -> str:
+        """How one knows what initialisations cost (see :class:`.describe.InitCost`).
+
+        Args:
+            times: of the trace that the times are taken from.
+        """
+        source = self.source()
+        if isinstance(source, (Initialised, RandomSource)) and source.init_ns is not None:
+            found = f"{ASSUMED}{source.init_ns / 1e6:g} ms"
+        elif isinstance(source, Constant):
+            found = AS_A_FRAME
+        elif isinstance(source, RandomSource) or source in (sources.by_frame, sources.by_call):
+            found = times.init_source
+        else:
+            found = f"given by {label_of(self.latency)}"
+        return found if self.scale == 1 else f"{found} x {self.scale}"
+
     def replay(
-        self, trace: TraceLike, sequences: str | Iterable[str] | None = None, batch: bool = False
+        self,
+        trace: TraceLike,
+        sequences: str | Iterable[str] | None = None,
+        batch: bool = False,
+        pre_forecaster: AnyFactory | None = None,
     ) -> Runs:
         """Replay a trace in this world.
 
@@ -237,6 +297,7 @@ class World:
             sequences: those wanted; all by default.
             batch: schedule many sequences at once where policy and latency allow it (see
                 :func:`lae_sim.engine.lanes.batchable`). The runs are the same.
+            pre_forecaster: what the world's name of one stands for; without it, none is used.
 
         Raises:
             LaeError: if a trace is missing or damaged, or the passes do not go together.
@@ -252,6 +313,7 @@ class World:
             None if self.timing is None else open_trace(self.timing),
             (*(each if names is None else each.chosen(names) for each in strided), *gaps),
             batch,
+            find_search(self.search, opened.metadata, gaps, pre_forecaster, self.keep_size),
         )
 
 
@@ -264,13 +326,14 @@ def replay_trace(
     scale: Number = 1,
     timing: TraceLike | None = None,
     passes: TraceLike | Iterable[TraceLike] = (),
+    search: str = "trace",
     batch: bool = False,
 ) -> Runs:
     """Replay every sequence of a trace, one after another.
 
     Args:
         trace: the boxes and the truth: an open trace, or the path or URL of one.
-        fps, policy, latency, scale, timing, passes: see :meth:`World.of`.
+        fps, policy, latency, scale, timing, passes, search: see :meth:`World.of`.
         batch: see :meth:`World.replay`.
 
     Returns:
@@ -292,6 +355,7 @@ def replay_trace(
         policy=policy,
         latency=latency,
         scale=scale,
+        search=search,
         **open_others(timing, passes),
     )
     return world.replay(opened, batch=batch)
@@ -355,11 +419,15 @@ def parse_policy(text: str) -> Policy:
 def parse_latency(text: str) -> LatencySource:
     """A latency source by name.
 
-    A user's own is named ``package.module:object``: a source, or a class that makes one.
+    A user's own is named ``package.module:object``: a source, or a class that makes one. Every name
+    may end in ``,init=TIME``, what the initialisation takes: ``constant:47ms,init=800ms``.
 
     Raises:
         LaeError: if there is none of that name, or its value does not fit.
     """
+    text, init_ns = split_init(text)
+    if init_ns is not None:
+        return initialised(parse_latency(text), init_ns)
     name, colon, value = text.partition(":")
     if text == "recorded":
         return sources.by_frame
@@ -380,7 +448,8 @@ def parse_latency(text: str) -> LatencySource:
     meant = f"; did you mean constant:{text}?" if text[:1].isdigit() else hint(name, _LATENCIES)
     raise LaeError(
         f"no latency {text!r}: there are recorded, by-call, constant:47ms, resample:SEED, "
-        f"lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object{meant}"
+        f"lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object, all of them perhaps with "
+        f",init=TIME{meant}"
     )
 
 
@@ -457,7 +526,7 @@ def _made(name: str, given: Any, parse: Callable[[str], object], known: Iterable
     if not isinstance(given, str):
         return given
     made = named(name, parse, given)
-    return given if given.partition(":")[0] in known else Plugin(given, made)
+    return given if kind_of(given) in known else Plugin(given, made)
 
 
 def _distinct(name: str, plugins: Iterable[Any]) -> list[Any]:
@@ -466,7 +535,7 @@ def _distinct(name: str, plugins: Iterable[Any]) -> list[Any]:
     for each in plugins:
         label = label_of(each)
         known = isinstance(each, str) or hasattr(each, "label")  # which says all of it
-        if label in found and not (known or each is found[label]):
+        if label in found and not (known or each == found[label]):
             raise LaeError(f"{name}: two are called {label!r}: give functions names")
         found.setdefault(label, each)
     return list(found.values())
@@ -483,9 +552,16 @@ def label_of(plugin: object) -> str:
     """The name of a policy or a source of times in tables."""
     if isinstance(plugin, str):
         return plugin
+    if isinstance(plugin, Initialised):
+        return f"{label_of(plugin.source)},init={time_label(plugin.init_ns)}"
     own = {id(sources.by_frame): "recorded", id(sources.by_call): "by-call"}.get(id(plugin))
     label = own or getattr(plugin, "label", None) or getattr(plugin, "__name__", None)
     return str(label or type(plugin).__name__)
+
+
+def kind_of(label: str) -> str:
+    """What kind of policy or source a label names: all before its values, as ``"constant"``."""
+    return re.split("[:,]", label, maxsplit=1)[0]
 
 
 def _plugin(what: str, text: str, known: Iterable[str]) -> Any:

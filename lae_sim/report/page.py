@@ -152,6 +152,7 @@ def _facts(view: View) -> dict[str, str]:
         "cells": f"{len(results.plan.cells):,}, {len(results.failures):,} pieces failed",
         "repetitions": f"{repeated:,} of random latencies" if repeated > 1 else "1",
         "replays": replays,
+        "initialisation": "; ".join(results.init_sources()),
         "uncertainty": "[ ]: 95 % percentile bootstrap over sequences, seed "
         f"{results.plan.study.seed}",
         "made with": f"lae_sim {__version__}",

@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 from collections import ChainMap
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from fractions import Fraction
 from functools import partial
 from operator import itemgetter
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 
 from lae_sim.engine.clock import Clock
+from lae_sim.evaluation.caveats import left_search
 from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.totals import RECOVERED, ScoreTotals, Totals, recovered
+from lae_sim.evaluation.modelled import MODELLED
+from lae_sim.evaluation.totals import RECOVERED, ModelledTotals, ScoreTotals, Totals, recovered
+from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.table import (
     CHANGE,
@@ -26,6 +30,7 @@ from lae_sim.report.table import (
     relative_change,
     text_of_records,
 )
+from lae_sim.trace.describe import InitCost
 from lae_sim.trace.metadata import Metadata
 
 Report = dict[str, Any]
@@ -37,6 +42,7 @@ def trace_report(
     forecasters: Sequence[str],
     sigmas: Sequence[Fraction],
     convention: str,
+    init: InitCost,
     per_sequence: SequenceRows | None = None,
     attributes: bool = True,
 ) -> Report:
@@ -48,6 +54,7 @@ def trace_report(
         forecasters: names; ``"hold"`` must be among them.
         sigmas: permitted latencies in frames, ascending.
         convention: the convention's name.
+        init: what initialisations cost.
         per_sequence: each sequence, if they are to be reported too.
         attributes: whether to report those attributes that the totals know.
     """
@@ -63,6 +70,7 @@ def trace_report(
         name: (scores.sequences, _scores(scores, forecasters))
         for name, scores in sorted(totals.by_attribute.items() if attributes else ())
     }
+    modelled = _modelled(totals.modelled, forecasters, totals.scores.complete)
     results = []
     for f, forecaster in enumerate(forecasters):
         means = {}
@@ -89,6 +97,7 @@ def trace_report(
                     name: {"sequences": count, **scores[f][s]}
                     for name, (count, scores) in by_attribute.items()
                 }
+            result["modelled"] = modelled[f][s] if modelled else None
             if per_sequence is not None:
                 result["per_sequence"] = per_sequence.of(f, s)
             results.append(result)
@@ -101,7 +110,8 @@ def trace_report(
         "mismatch_sum": int(staleness.mismatch_sum[zero]),
         "tracker_fps": calls / calls_ns * 1e9 if calls_ns else None,
         "tracker_fps_mean": _number(float(replay.calls_hz.sum()) / calls) if calls else None,
-        "init_ms": float(np.mean(replay.init_ns)) / 1e6,
+        "init_ms": init.mean_ms,
+        "init": {**asdict(init), "left_search": left_search(replay)},
         "exact": departures == 0,
         "approximate_outputs": departures,
         "approximate_share": replay.approximate_share,
@@ -125,6 +135,50 @@ def _scores(totals: ScoreTotals, forecasters: Sequence[str]) -> list[list[Report
         return scores
 
     count = len(means[METRICS[0]][0])
+    return [[one(f, s) for s in range(count)] for f in range(len(forecasters))]
+
+
+def search_report(
+    search: SearchModel | None, pre_forecaster: str | None, totals: ModelledTotals
+) -> Report | None:
+    """What the search model rests on; None where it says nothing of a trace."""
+    if search is None or totals.known is None:
+        return None
+    reach = search.reach
+    return {
+        "source": search.source,
+        "c_known": search.known,
+        "c_low": float(search.reaches[0]) if np.isfinite(search.reaches[0]) else None,
+        "c_high": float(search.reaches[-1]) if np.isfinite(search.reaches[-1]) else None,
+        "reach": None if reach is None else {"centre": reach.centre, "spread": reach.spread},
+        "own_jumps": len(search.jumps),
+        "pre_forecaster": pre_forecaster,
+        "keep_size": search.keep_size,
+        "sequences": totals.applies,
+        "lost_share": totals.lost_share,
+    }
+
+
+def _modelled(
+    totals: ModelledTotals, forecasters: Sequence[str], complete: bool
+) -> list[list[Report]] | None:
+    """Scores under the search model by forecaster and sigma; None where it says nothing."""
+    if totals.known is None:
+        return None
+    means = {metric: (totals.mean(metric), *totals.interval(metric)) for metric in MODELLED}
+    changes = {metric: totals.recovered(metric) for metric in MODELLED}
+
+    def one(f: int, s: int) -> Report:
+        scores: Report = {"c_known": totals.known}
+        for metric in MODELLED:
+            for end, values in zip(("", "_low", "_high"), means[metric]):
+                scores[f"{metric}{end}"] = _number(values[f, s])
+            won, lost = (float(values[f, s]) for values in changes[metric])
+            comparable = complete and forecasters[f] != "hold"
+            scores[f"recovered_{metric}"] = recovered(won, lost) if comparable else None
+        return {**scores, "lost_share": totals.lost_share}
+
+    count = means[MODELLED[0]][0].shape[1]
     return [[one(f, s) for s in range(count)] for f in range(len(forecasters))]
 
 
@@ -171,8 +225,11 @@ class SequenceRows:
             part.staleness.mismatch_sum[:, s].tolist(),
             replay.departures.tolist(),
             replay.disagreement.tolist(),
+            (replay.init_ns / 1e6).tolist(),
         )
-        for i, (name, frames, processed, mismatch, departures, disagreement) in enumerate(columns):
+        for i, (name, frames, processed, mismatch, departures, disagreement, init_ms) in enumerate(
+            columns
+        ):
             shares = {}
             for metric in RECOVERED:
                 won = scores[metric][i] - hold[metric][i]
@@ -185,6 +242,7 @@ class SequenceRows:
                 "sequence": name,
                 "world_frames": frames,
                 "processed": processed,
+                "init_ms": init_ms,
                 "mismatch_sum": mismatch,
                 "approximate_outputs": departures,
                 "disagreement": _number(disagreement),
@@ -192,7 +250,25 @@ class SequenceRows:
                 "offline_dp20": _number(offline["dp20"][i]),
                 **{metric: _number(scores[metric][i]) for metric in METRICS},
                 **shares,
+                "modelled": self._modelled(part, f, i, s),
             }
+
+    def _modelled(self, part: Evaluation, f: int, i: int, s: int) -> Report | None:
+        """What the search model says of a sequence; None where its replay is exact."""
+        modelled = part.modelled
+        if not modelled.applies[i]:
+            return None
+        scores: Report = {"c_known": modelled.known}
+        for metric in MODELLED:
+            mean = modelled.mean[metric][:, i, s]
+            scores[metric] = _number(mean[f])
+            scores[f"{metric}_low"] = _number(modelled.low[metric][f, i, s])
+            scores[f"{metric}_high"] = _number(modelled.high[metric][f, i, s])
+            won, lost = mean[f] - mean[self._hold], part.offline[metric][i] - mean[self._hold]
+            comparable = f != self._hold and math.isfinite(won + lost)
+            share = recovered(float(won), float(lost)) if comparable else None
+            scores[f"recovered_{metric}"] = share
+        return {**scores, "lost_share": float(modelled.lost_share[i])}
 
 
 def attribute_members(metadata: Metadata, sequences: Iterable[str]) -> dict[str, list[int]]:
@@ -259,6 +335,11 @@ def summary_table(
             Column("change", partial(_change, metric), CHANGE),
             Column("recov.", f"recovered_{metric}", PERCENT),
         ]
+        if any(result["modelled"] for report in reports for result in report["results"]):
+            columns += [
+                Column("modelled", partial(_modelled_of, metric), _SCORE),
+                Column("[low, high]", partial(_interval_of, metric)),
+            ]
     if any("mauc" in result for report in reports for result in report["results"]):
         columns += [Column("mAUC", "mauc", _SCORE), Column("mDP", "mdp", _SCORE)]
     columns += [
@@ -267,6 +348,18 @@ def summary_table(
         Column("mismatch", "mismatch_mean", _FRAMES),
     ]
     return _text(columns, _lines(zip(labels, reports), shown_sigmas), "trace", swept)
+
+
+def _modelled_of(metric: str, line: Line) -> float | None:
+    score: float | None = line["modelled"] and line["modelled"][metric]
+    return score
+
+
+def _interval_of(metric: str, line: Line) -> str | None:
+    modelled = line["modelled"]
+    if not modelled or modelled[f"{metric}_low"] is None:
+        return None
+    return f"[{modelled[f'{metric}_low']:.3f}, {modelled[f'{metric}_high']:.3f}]"
 
 
 def _change(metric: str, line: Line) -> float | None:
@@ -287,13 +380,16 @@ def settings_text(report: Report) -> str:
             f", times from {report['times_from']}"
             if report["times_from"] != report["trace"]
             else ""
-        )
-        + f" (initialisation {report['init_ms']:.1f} ms on average)",
+        ),
     ]
     if report["times_note"] is not None:
         lines.append(f"  times: {report['times_note']}")
-    lines += [f"  {note}" for note in report["notes"]]
+    cost = {key: value for key, value in report["init"].items() if key != "left_search"}
+    lines.append(f"  {InitCost(**cost)}")
+    lines += [_wrapped(note) for note in report["notes"]]
     share = f"{report['approximate_outputs']:,} outputs ({100 * report['approximate_share']:.3g}%)"
+    if report["search"] is not None:
+        lines += _search_text(report["search"])
     if report["exact"]:
         lines.append("  exact: every output follows the same frame as when it was recorded")
     elif report["strided"]:
@@ -307,6 +403,35 @@ def settings_text(report: Report) -> str:
             "a stateful\n  tracker would have seen larger motion there, so this is optimistic"
         )
     return "\n".join(lines)
+
+
+def _search_text(search: Report) -> list[str]:
+    """What the modelled figures rest on, in lines."""
+    interval = "an interval of 95 %" if search["c_known"] else "the ends of that range"
+    lines = [
+        "  modelled: a target is found within c search sides of where the tracker searches; "
+        f"{search['source']};",
+        f"  lost for {100 * search['lost_share']:.3g}% of the outputs; [low, high]: {interval}",
+    ]
+    if search["pre_forecaster"] is not None:
+        kept = ", the size is kept" if search["keep_size"] else ""
+        lines.append(
+            f"  pre-forecaster {search['pre_forecaster']} says where the tracker searches{kept}: "
+            "the model's figures alone"
+        )
+    if not search["c_known"]:
+        lines.append(
+            "  measure c: lae-sim profile --gaps, then --strided TRACE.gaps.parquet; or name it: "
+            "--search c=0.7"
+        )
+    return lines
+
+
+def _wrapped(note: str) -> str:
+    """A note that may name many sequences."""
+    if len(note) < 180:
+        return f"  {note}"
+    return fill(note, 98, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
 
 
 def attribute_table(
@@ -338,7 +463,10 @@ def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequenc
         Column("offline", "offline_dp20", _SCORE),
         Column("frames", "world_frames"),
         Column("processed", "processed"),
+        Column("init", "init_ms", Number(".1f", unit=" ms")),
         Column("mismatch", lambda line: line["mismatch_sum"] / line["world_frames"], _FRAMES),
+        Column("modelled AUC", partial(_modelled_of, "auc"), _SCORE),
+        Column("[low, high]", partial(_interval_of, "auc")),
         Column("approximate", "approximate_outputs"),
         Column("disagree", "disagreement", PERCENT),
     ]

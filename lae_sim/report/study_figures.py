@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.comparison.statistics import ALL_TRACES, Interval
-from lae_sim.engine.clock import parse_duration
+from lae_sim.engine.clock import parse_duration, split_init
 from lae_sim.report.figures import Curve, Line, Panel, draw_curves, draw_sweep
 from lae_sim.report.study_view import SETTINGS, View, run_of, setting_of, shared_setting
 from lae_sim.report.style import (
@@ -128,21 +128,24 @@ SWEEPS = {
     "scale": "scale of all times (2: half as fast)",
     "fps": "world rate (frames/s)",
     "latency": "constant latency (ms)",
+    "init": "time of an initialisation (ms)",
 }
 """What scores are drawn over, if a study has several: the key of the summary, and its label."""
 
 
 def sweep(view: View, key: str) -> Picture | None:
     """AUC and DP of each dataset over a key of ``SWEEPS``; None if it has one value only."""
+    varied = "latency" if key == "init" else key  # whose name says the initialisation
     points: list[tuple[float, SummaryRow]] = []
     for row in view.results.summary if key == "sigma" else view.rows:
-        settings = zip(SETTINGS, setting_of(row), view.chosen[run_of(row)])
-        x = _place(getattr(row, key))
-        if x is not None and all(own == chosen for name, own, chosen in settings if name != key):
+        chosen = dict(zip(SETTINGS, view.chosen[run_of(row)]))
+        x = _place(row, key, str(chosen["latency"]))
+        settings = zip(SETTINGS, setting_of(row))
+        if x is not None and all(own == chosen[name] for name, own in settings if name != varied):
             points.append((x, row))
     if len({x for x, _ in points}) < 2:
         return None
-    caption = f"Over {SWEEPS[key].split(' (')[0]}: {shared_setting(view.standing, but=key)}"
+    caption = f"Over {SWEEPS[key].split(' (')[0]}: {shared_setting(view.standing, but=varied)}"
     panels: list[Panel] = []
     for dataset in dict.fromkeys(row.dataset for _, row in points):
         within = [(x, row) for x, row in points if row.dataset == dataset]
@@ -153,12 +156,20 @@ def sweep(view: View, key: str) -> Picture | None:
     return Picture(caption, svg_of(draw_sweep(panels, 2, sharex=True)))
 
 
-def _place(value: str | Fraction) -> float | None:
-    """Where a value stands on its axis; None if it is not on it."""
-    if isinstance(value, Fraction):
-        return float(value)
-    latency, _, time = value.partition(":")
-    return parse_duration(time) / 1e6 if latency == "constant" else None
+def _place(row: SummaryRow, key: str, chosen: str) -> float | None:
+    """Where a row stands on the axis of a key; None if it is not on it.
+
+    Constant latencies are drawn at the initialisation of the latency that stands for all, and
+    initialisations at its other times.
+    """
+    if key in ("latency", "init"):
+        (times, init_ns), (its_times, its_init_ns) = split_init(row.latency), split_init(chosen)
+        if key == "init":
+            return None if init_ns is None or times != its_times else init_ns / 1e6
+        kind, _, time = times.partition(":")
+        return parse_duration(time) / 1e6 if (kind, init_ns) == ("constant", its_init_ns) else None
+    value = getattr(row, key)
+    return float(value) if isinstance(value, Fraction) else None
 
 
 def _sweep_panels(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
 from lae_sim.report.table import COUNT, Column, Number, Table, text_of
-from lae_sim.trace.describe import Report, gathered
+from lae_sim.trace.describe import InitCost, Report, gathered
 
 if TYPE_CHECKING:
     from lae_sim.profile.passes import PassSummary
@@ -41,7 +41,7 @@ def overview(report: Mapping[str, Any]) -> str:
     lines.append(_entry("frames", _frames(report)))
     if failures:
         lines.append(_entry("failures", f"{len(failures)}: {_words(failures[:5])}"))
-    lines += [*_readings(provenance.get("device")), "", *_times(times)]
+    lines += [*_readings(provenance.get("device")), "", *_times(report)]
     if times["histogram"]:
         lines += ["", *_histogram(times["histogram"])]
     lines += ["", *_drift(times), *_stalls(times["stalls"])]
@@ -127,7 +127,8 @@ def _range(taken: Any, figure: Callable[[Any], float]) -> str:
     return " to ".join(dict.fromkeys(map(_figure, [min(values), max(values)]))) if values else ""
 
 
-def _times(times: Mapping[str, Any]) -> list[str]:
+def _times(report: Mapping[str, Any]) -> list[str]:
+    times = report["times"]
     names = ("mean_ms", "median_ms", "p90_ms", "p95_ms", "p99_ms", "max_ms", "fps")
     columns = [
         Column("times, ms", "kind", is_label=True),
@@ -138,7 +139,7 @@ def _times(times: Mapping[str, Any]) -> list[str]:
     table = Table.of(columns, [each for each in kinds if each["n"]])
     share, interval = 100 * times["slower_than_frames"], _figure(times["frame_interval_ms"])
     late = f"{share:.3g}% of the calls take longer than the interval between frames, {interval} ms"
-    return [*text_of(table).splitlines(), late]
+    return [*text_of(table).splitlines(), late, _words(InitCost(**report["init"]))]
 
 
 def _figure(value: float) -> str:

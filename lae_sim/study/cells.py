@@ -26,13 +26,13 @@ from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes
 from lae_sim.replay.latency import RandomSource
 from lae_sim.replay.run import Run, replay_repeated
-from lae_sim.replay.world import World, label_of
+from lae_sim.replay.world import World, kind_of, label_of
 from lae_sim.study.rows import CellRows
-from lae_sim.study.spec import RANDOM
+from lae_sim.study.spec import is_random
 from lae_sim.trace.file import Trace, held, read_trace
 from lae_sim.trace.metadata import Metadata
 
-VERSION = 2
+VERSION = 3
 """Of the cells' files; another version is another cell."""
 
 GROUP = 1 << 17
@@ -99,8 +99,8 @@ class Setting:
     def latency(self) -> str:
         """The latency as the study names it, without the seed of a random one."""
         latency = label_of(self.world.latency)
-        kind = latency.partition(":")[0]
-        return kind if kind in RANDOM else latency
+        kind, (_, comma, init) = kind_of(latency), latency.partition(",")
+        return f"{kind}{comma}{init}" if is_random(latency) else latency
 
     def columns(self) -> dict[str, str]:
         """What names the replay in tables."""
@@ -191,7 +191,8 @@ class Result:
     Attributes:
         key: the cell's.
         rows: a Parquet file (see :mod:`lae_sim.study.rows`).
-        about: curves at the first sigma, how many outputs are approximate, the engine, notes.
+        about: curves at the first sigma, how many outputs are approximate, the engine, where times
+            of initialisations are from, notes.
     """
 
     key: str
@@ -254,6 +255,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
             "curves": _curves(curves, f),
             "approximate_outputs": departures,
             "calls": calls,
+            "init_source": world.init_source(replay.times),
             "notes": [
                 *notes_on(about, trace.metadata, convention, only),
                 *cost_notes({cell.forecaster: cell.cost_ns} if cell.cost_ns else {}),
@@ -282,10 +284,12 @@ class Replayed:
     Attributes:
         runs: repetition and run, as they are made.
         engine: ``"batch"``, or ``"simpy"`` where the policy or the source of times knows no lanes.
+        times: metadata of the trace that the times are from.
     """
 
     runs: Iterable[tuple[int, Run]]
     engine: str
+    times: Metadata
 
 
 def replayed(setting: Setting, trace: Trace) -> Replayed:
@@ -296,8 +300,9 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
         trace: the setting's, as it was read.
     """
     runs = setting.world.replay(trace, batch=True)
-    times = runs.source(next(iter(runs.timing or trace)))
+    times = runs.source(next(iter(runs.times)))
     engine = "batch" if batchable([times], runs.policy) else "simpy"
     if isinstance(runs.source, RandomSource):
-        return Replayed(replay_repeated(runs, setting.count, setting.first), engine)
-    return Replayed(((0, run) for run in runs), engine)
+        repeated = replay_repeated(runs, setting.count, setting.first)
+        return Replayed(repeated, engine, runs.times.metadata)
+    return Replayed(((0, run) for run in runs), engine, runs.times.metadata)

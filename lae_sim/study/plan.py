@@ -17,7 +17,7 @@ from lae_sim.learning.folds import Trainer
 from lae_sim.learning.registry import load_any
 from lae_sim.replay.world import World
 from lae_sim.study.cells import Cell, Input, Setting, Task
-from lae_sim.study.spec import RANDOM, Study
+from lae_sim.study.spec import Study, is_random
 from lae_sim.trace.file import read_trace
 from lae_sim.trace.locate import digest, find_traces, stamp
 from lae_sim.trace.metadata import Metadata
@@ -75,7 +75,7 @@ class Plan:
         study, wanted = self.study, self.study.sequences or None
         own = {cell.setting.trace: None for cell in self.cells}
         read = {each.label: read_trace(each.path, wanted) for each in own}
-        fixed = [name for name in study.latencies if name not in RANDOM] or ["recorded"]
+        fixed = [name for name in study.times if not is_random(name)] or ["recorded"]
         worlds = World.sweep(
             policy=study.policies[0], fps=study.fps[0], latency=fixed, scale=study.scales
         )
@@ -136,12 +136,12 @@ def tasks(cells: Iterable[Cell], factories: Mapping[str, AnyFactory]) -> list[Ta
 def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Setting]:
     """All ways in which a trace is replayed."""
     other_times = [other.input for other in timing if _same_runs(source, other)]
-    codes = {name: _own_code(name) for name in (*study.policies, *study.latencies)}
+    codes = {name: _own_code(name) for name in (*study.policies, *study.times)}
     rates = dict.fromkeys(source.metadata.fps if fps is None else fps for fps in study.fps)
     found = []
     chunk = max(1, CHUNK_FRAMES // (max(source.frames, 1) * max(1, len(study.sigmas) // 8)))
     for times, policy, fps, latency, scale in product(
-        [None, *other_times], study.policies, rates, study.latencies, study.scales
+        [None, *other_times], study.policies, rates, study.times, study.scales
     ):
         world = World(
             fps=fps,
@@ -160,7 +160,7 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
             count=1,
             sequences=tuple(sorted(study.sequences)),
         )
-        repetitions = study.repetitions if latency in RANDOM else 1
+        repetitions = study.repetitions if is_random(latency) else 1
         found += [
             replace(setting, first=first, count=min(chunk, repetitions - first))
             for first in range(0, repetitions, chunk)
@@ -177,7 +177,7 @@ def _same_runs(source: Source, other: Source) -> bool:
 
 def _training(study: Study, traces: Sequence[Source]) -> str:
     """Digest of what trained forecasters depend on."""
-    document = study.document()
+    document = {**study.document(), "latencies": list(study.times)}
     keys = ("latencies", "scales", "fps", "policies", "sequences", "folds", "seed")
     values = [*(document[key] for key in keys), *(source.input.digest for source in traces)]
     return text_digest(repr(values))

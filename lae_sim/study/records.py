@@ -108,6 +108,8 @@ class SummaryRow(Record):
         exact: whether every output follows the same frame as when recorded.
         approximate_share: of the outputs, those that do not.
         elapsed_ms: mean time of a call but the initialisation; None without such a call.
+        init_ms: mean time of an initialisation.
+        init_source: how one knows that (see :class:`lae_sim.trace.describe.InitCost`).
         skip_rate: share of frames never processed.
         sigma: permitted latency, frames, or ``MEAN`` over the grid of them.
         scores, offline: mean of each metric in 0..1, under and without latency; None if unknown.
@@ -133,6 +135,8 @@ class SummaryRow(Record):
     exact: bool
     approximate_share: float
     elapsed_ms: float | None
+    init_ms: float
+    init_source: str
     skip_rate: float
     sigma: Fraction | str
     scores: Mapping[str, float | None]

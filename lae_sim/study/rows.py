@@ -34,6 +34,7 @@ COLUMNS = {
     "processed": "int32",
     "approximate_outputs": "int32",
     "elapsed_ms": "float64",
+    "init_ms": "float64",
     "mismatch_mean": "float64",
     "mismatch_max": "int32",
     "longest_hold": "int32",
@@ -43,10 +44,10 @@ COLUMNS = {
 }
 """Columns of the results, and their types.
 
-``elapsed_ms`` is the mean time of the calls but the initialisation, ``longest_hold`` and the
-mismatches are in frames, ``failure_frame`` is the first whose answer does not overlap the truth
-(``world_frames`` if there is none); scores are in 0..1, NaN where the sequence leaves the mean or,
-offline, where the trace lacks boxes.
+``elapsed_ms`` is the mean time of the calls but the initialisation, ``init_ms`` the latter's;
+``longest_hold`` and the mismatches are in frames, ``failure_frame`` is the first whose answer does
+not overlap the truth (``world_frames`` if there is none); scores are in 0..1, NaN where the
+sequence leaves the mean or, offline, where the trace lacks boxes.
 """
 
 
@@ -79,6 +80,7 @@ class CellRows:
             "processed": replay.processed,
             "approximate_outputs": replay.departures,
             "elapsed_ms": replay.calls_ns / calls / 1e6,
+            "init_ms": replay.init_ns / 1e6,
             **{f"offline_{metric}": part.offline[metric] for metric in METRICS},
         }
         values = {name: np.repeat(column, count) for name, column in once.items()}

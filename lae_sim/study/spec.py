@@ -12,13 +12,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from lae_sim.engine.clock import exact, parse_fps, whole
+from lae_sim.engine.clock import exact, parse_duration, parse_fps, split_init, whole
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.replay.world import (
     check_sigmas,
     flag,
+    kind_of,
     named,
     parse_latency,
     parse_policy,
@@ -46,7 +47,9 @@ class Study:
         policies: which frame a free tracker takes.
         fps: world frame rates; None is each trace's own.
         latencies: where times come from: ``"recorded"``, ``"by-call"``, ``"constant:47ms"``, or one
-            of ``RANDOM``, which is repeated.
+            of ``RANDOM``, which is repeated. Each may end in ``,init=TIME``.
+        init: what the initialisation takes, one or several durations, each with every latency;
+            none: what the latency says.
         scales: exact factors on all times.
         sigmas: permitted latencies in frames, ascending.
         conventions: how frames and thresholds count.
@@ -75,6 +78,7 @@ class Study:
     policies: tuple[str, ...] = ("latest",)
     fps: tuple[Fraction | None, ...] = (None,)
     latencies: tuple[str, ...] = ("recorded",)
+    init: tuple[str, ...] = ()
     scales: tuple[Fraction, ...] = (Fraction(1),)
     sigmas: tuple[Fraction, ...] = (Fraction(0),)
     conventions: tuple[str, ...] = ("pysot",)
@@ -95,7 +99,7 @@ class Study:
         if self.repetitions > 1_000_000:
             raise LaeError(f"repetitions: {self.repetitions} are too many: at most a million")
         for latency in self.latencies:
-            _check_latency(latency)
+            _check_latency(latency, swept=bool(self.init))
         for policy in self.policies:
             if not scores_latency(parse_policy(policy)):
                 raise LaeError(f"policies: {policy} never scores latency: it goes with replay")
@@ -129,16 +133,29 @@ class Study:
             raise LaeError("the key 'traces' is missing: name files, folders, globs or URLs")
         return cls(**values)
 
+    @property
+    def times(self) -> tuple[str, ...]:
+        """Every latency with every time of the initialisation, such as ``"recorded,init=1s"``."""
+        if not self.init:
+            return self.latencies
+        return tuple(f"{latency},init={init}" for latency in self.latencies for init in self.init)
+
     def seeded(self, latency: str) -> str:
         """A latency of the study as a replay names it: random times with their seed."""
-        if latency not in RANDOM:
+        if not is_random(latency):
             return latency
-        block = f":{self.block}" if latency == "bootstrap" else ""
-        return f"{latency}:{self.seed}{block}"
+        name, comma, init = latency.partition(",")
+        block = f":{self.block}" if name == "bootstrap" else ""
+        return f"{name}:{self.seed}{block}{comma}{init}"
 
     def document(self) -> dict[str, Any]:
         """Plain values of everything, for provenance and digests."""
         return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+
+
+def is_random(latency: str) -> bool:
+    """Whether a latency of a study is drawn anew in each repetition."""
+    return kind_of(latency) in RANDOM
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
@@ -175,14 +192,16 @@ def read_study(path: str | os.PathLike[str]) -> Study:
         raise LaeError(f"{path}: {error}") from error
 
 
-def _check_latency(latency: str) -> None:
-    name, _, value = latency.partition(":")
+def _check_latency(latency: str, swept: bool) -> None:
+    name, init_ns = named("latencies", split_init, latency)
+    if swept and init_ns is not None:
+        raise LaeError(f"latencies: {latency!r} names its init, and so does the key init")
     if name in RANDOM:
-        if value:
-            raise LaeError(f"latencies: {latency!r}: in a study the keys seed and block say so")
         return
+    if is_random(name):
+        raise LaeError(f"latencies: {latency!r}: in a study the keys seed and block say so")
     try:
-        parse_latency(latency)
+        parse_latency(name)
     except LaeError as error:
         raise LaeError(f"latencies: {error} (in a study: {', '.join(RANDOM)} as they are)") from (
             error
@@ -213,6 +232,11 @@ def _rate(value: Any) -> Fraction | None:
     return None if value is None or value == "trace" else parse_fps(value)
 
 
+def _duration(value: Any) -> str:
+    parse_duration(value)
+    return text(value)
+
+
 def _sigmas(value: Any) -> tuple[Fraction, ...]:
     return parse_sigmas(value) if value == "grid" else parse_sigmas(_several(exact)(value))
 
@@ -237,6 +261,7 @@ _KEYS: Mapping[str, tuple[str, Callable[[Any], Any]]] = {
     "policies": ("policies", _several(text)),
     "fps": ("fps", _several(_rate)),
     "latencies": ("latencies", _several(text)),
+    "init": ("init", _several(_duration)),
     "scales": ("scales", _several(exact)),
     "sigma": ("sigmas", _sigmas),
     "conventions": ("conventions", _several(text)),

@@ -41,8 +41,8 @@ class Scores:
             of ``mismatch_max`` and ``longest_hold`` the largest (frames).
         repeated: ``auc``, ``dp20`` and ``failure_frame`` at the first sigma, float64 [R, S].
         over_sigmas: ``auc`` and ``dp20`` as plain means over sigma, float64 [R, S].
-        once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms`` and the offline
-            scores, float64 [S].
+        once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms``, ``init_ms`` and
+            the offline scores, float64 [S].
         about: of each cell (see :class:`lae_sim.study.cells.Result`).
     """
 
@@ -83,7 +83,7 @@ class Scores:
 _WORST = {"mismatch_max", "longest_hold"}
 _STALENESS = ("mismatch_mean", *sorted(_WORST))
 _REPEATED = ("auc", "dp20", "failure_frame")
-_ONCE = ("world_frames", "processed", "elapsed_ms", *(f"offline_{m}" for m in METRICS))
+_ONCE = ("world_frames", "processed", "elapsed_ms", "init_ms", *(f"offline_{m}" for m in METRICS))
 
 
 def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
@@ -203,6 +203,8 @@ def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator
         exact=departures == 0,
         approximate_share=departures / calls if calls else 0.0,
         elapsed_ms=_mean(scores.once["elapsed_ms"]),
+        init_ms=float(scores.once["init_ms"].mean()),
+        init_source=scores.about[0]["init_source"],
         skip_rate=float(1 - scores.once["processed"].sum() / frames.sum()),
         sigma=MEAN,
         scores={},

@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Floats, Ints
+from lae_sim.trace.metadata import TRACES_TIMES
 from lae_sim.trace.recording import Recording
 
 if TYPE_CHECKING:
@@ -22,6 +23,62 @@ if TYPE_CHECKING:
 
 STALL = 10
 """A call is a stall if it takes more than so many times the median."""
+
+
+ASSUMED = "assumed: "
+AS_A_FRAME = f"{ASSUMED}as a frame"
+"""What is said of the source of initialisation times that nobody has measured."""
+
+
+@dataclass(frozen=True)
+class InitCost:
+    """What the initialisations of some sequences cost, and how one knows.
+
+    Attributes:
+        mean_ms, min_ms, max_ms: over the sequences, ms.
+        source: ``"measured"``, ``"assumed: ..."``, ``"given by ..."`` or ``"the trace's times:
+            ..."`` (see :meth:`lae_sim.replay.world.World.init_source`), perhaps with a scale.
+    """
+
+    mean_ms: float
+    min_ms: float
+    max_ms: float
+    source: str
+
+    @classmethod
+    def of(cls, init_ns: Ints, source: str) -> InitCost:
+        """Of the times of some initialisations, ns, int64 [S], S > 0."""
+        ms = init_ns / 1e6
+        return cls(float(ms.mean()), float(ms.min()), float(ms.max()), source)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the times, before they were scaled, were measured somewhere."""
+        return is_measured(self.source)
+
+    def __str__(self) -> str:
+        """A sentence."""
+        mean, least, most = map(in_ms, (self.mean_ms, self.min_ms, self.max_ms))
+        cost = f"initialisation costs {mean}"
+        if least != most:
+            cost += f" on average ({least} to {most})"
+        if self.source.startswith(AS_A_FRAME):
+            return f"{cost}, the same as a frame: an assumption; name it with ,init=TIME"
+        if self.source.startswith(ASSUMED):
+            return f"{cost}: an assumption"
+        if self.source.startswith(TRACES_TIMES) and not self.is_measured:
+            return f"{cost}: an assumption ({self.source})"
+        return f"{cost}, {self.source}"
+
+
+def is_measured(source: str) -> bool:
+    """Whether a source of an :class:`InitCost` is a measurement."""
+    return source.removeprefix(TRACES_TIMES).startswith("measured")
+
+
+def in_ms(ms: float) -> str:
+    """A time in words, to three digits or to the millisecond."""
+    return f"{ms:,.0f} ms" if ms >= 1000 else f"{ms:.3g} ms"
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +299,7 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
         "image_sizes": dict(sizes.most_common()),
         "lost": sum(lost) if all(isinstance(n, int) for n in lost) else None,
         "failures": failures if isinstance(failures, list) else [],
+        "init": asdict(InitCost.of(np.array([s.init_ns for s in sequences]), metadata.init_source)),
         "times": {
             "calls": summary(calls),
             "initialisations": summary(np.array([s.init_ns for s in sequences])),

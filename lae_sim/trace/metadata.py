@@ -20,6 +20,7 @@ VERSION = "1.0"
 RESTARTS_VERSION = "1.1"
 """Of traces of kind restarts, which readers of 1.0 do not know; all others are readable by them."""
 KINDS = ("every-frame", "real-time", "restarts")
+TRACES_TIMES = "the trace's times: "
 
 
 @dataclass(frozen=True)
@@ -162,6 +163,17 @@ class Metadata:
         """What the trace says of times that were not measured, if it does."""
         note = self.document.get("timing", {}).get("source")
         return None if note in (None, "measured") else str(note)
+
+    @property
+    def init_source(self) -> str:
+        """``"measured"``, if the times of initialisations are, or what the trace says of them."""
+        timing = self.document.get("timing", {})
+        source, note = timing.get("source"), timing.get("note")
+        if source is None:
+            source = "measured" if self.profiled else "whether measured, it does not say"
+        if source == "measured" and note is None:
+            return "measured"
+        return f"{TRACES_TIMES}{source}" + ("" if note is None else f"; {note}")
 
     @property
     def names_attributes(self) -> bool:

@@ -124,6 +124,22 @@ def test_the_json_object(everything: tuple[dict[str, Any], Path]) -> None:
     assert {"all sequences", "Fast camera motion", "Occlusion"} <= named
 
 
+def test_what_initialisation_costs_is_said_of_each_replay() -> None:
+    latencies = ("constant:20ms,init=1s", "constant:20ms")
+    options = (SLOW, *FEW, "--forecaster", "kalman", "--latency", *latencies)
+    document = json.loads(compare(*options, "--json"))
+    said = [(each["latency"], each["mean_ms"], each["source"]) for each in document["init"]]
+    assert said == [
+        ("constant:20ms,init=1s", 1000, "assumed: 1000 ms"),
+        ("constant:20ms", 20, "assumed: as a frame"),
+    ]
+    assert document["init"][0]["left_search"]
+    assert document["init"][1]["left_search"] == []
+    text = compare(*options)
+    assert "constant:20ms,init=1s: initialisation costs 1,000 ms: an assumption" in text
+    assert "constant:20ms: initialisation costs 20 ms, the same as a frame: an assumption" in text
+
+
 def test_the_table_that_is_written(everything: tuple[dict[str, Any], Path]) -> None:
     document, folder = everything
     table = pd.read_csv(folder / "all.csv")

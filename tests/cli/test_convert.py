@@ -104,6 +104,18 @@ def test_given_times_are_said_to_be_given(world, convert):
         assert {ns} == {time for recording in trace for time in recording.elapsed_ns.tolist()}
 
 
+def test_the_first_frame_of_each_sequence_takes_what_the_initialisation_does(world, convert):
+    for option, frame_ns in (("constant:47ms", 47_000_000), ("mean-fps:120", 8_333_333)):
+        status, out, _ = convert("KCF", "--time", f"{option},init=800ms")
+        assert status == 0
+        assert ", initialisation 800 ms, not measured" in out
+        trace = read_trace(world / "t.parquet")
+        for recording in trace:
+            first, *others = recording.elapsed_ns.tolist()
+            assert first == 800_000_000
+            assert set(others) == {frame_ns}
+
+
 def test_mat_results(world, convert):
     for name, fps in (("a", 25.0), ("b", 50.0)):
         path = world / "mat" / f"{name}_ECO.mat"

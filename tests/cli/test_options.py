@@ -28,6 +28,14 @@ def test_latencies_by_name():
     assert times(parse_latency("bootstrap:3:1")) == times(bootstrap(3, 1))
 
 
+def test_every_name_may_tell_the_initialisation_apart():
+    for name in ("recorded", "by-call", "constant:4.7us", "resample:3", "lognormal:3",
+                 "bootstrap:3", "bootstrap:3:1"):  # fmt: skip
+        first, *others = times(parse_latency(f"{name},init=1us"))
+        assert first == 1000
+        assert others == times(parse_latency(name))[1:]
+
+
 OWN = """
 class Slowly:
     def __call__(self, clock, calls):
@@ -53,6 +61,9 @@ def test_a_latency_of_ones_own(tmp_path, monkeypatch):
     (tmp_path / "own_rules.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
     assert times(parse_latency("own_rules:double")) == [180_000_000, 60_000_000, 4]
+    assert times(parse_latency("own_rules:double,init=9ns")) == [9, 60_000_000, 4]
+    [world] = lae_sim.World.sweep(latency="own_rules:double,init=9ns")
+    assert world.label() == "own_rules:double,init=9ns"
     with pytest.raises(lae_sim.LaeError, match=r"latency 'own_rules:triple': .*triple"):
         parse_latency("own_rules:triple")
 
@@ -88,7 +99,9 @@ def test_a_policy_that_is_none_is_an_error_that_quotes_it(text):
 @pytest.mark.parametrize(
     "text", ["", "constant", "constant:47", "constant:0.1ns", "resample:", "resample:-1",
              "by-call:2", "lognormal:1.5", "normal:1", "bootstrap", "bootstrap:1:0",
-             "bootstrap:1:2:3", "bootstrap::3", "recorded:json", "no_such_module:source"]
+             "bootstrap:1:2:3", "bootstrap::3", "recorded:json", "no_such_module:source",
+             "constant:47ms,init=", "recorded,init=-1s", "recorded,int=1s", ",init=1s",
+             "constant:47,init=1s", "recorded,init=1s,init=1s", "no_such_module:source,init=1s"]
 )  # fmt: skip
 def test_a_latency_that_is_none_is_an_error(text):
     with pytest.raises(lae_sim.LaeError):

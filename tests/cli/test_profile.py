@@ -137,6 +137,7 @@ def test_a_profile_becomes_a_trace_with_its_provenance(here: Path) -> None:
 
 def test_json_says_the_same(here: Path) -> None:
     passes = ("--stride", "2", "--stride", "3", "--closed-loop", "constant:0.5ms")
+    passes += ("--closed-loop", "constant:0.5ms,init=1s")
     out, _ = profile(here, *MINE, "--sequence", "a", "--json", "--in-process", *passes)
     report = json.loads(out)
     assert [trace["trace"] for trace in report["traces"]] == [
@@ -144,7 +145,11 @@ def test_json_says_the_same(here: Path) -> None:
         "mine-Bright-data.stride2.parquet",
         "mine-Bright-data.stride3.parquet",
         "mine-Bright-data.closed-loop-0.5ms.parquet",
+        "mine-Bright-data.closed-loop-0.5ms-init-1000ms.parquet",
     ]
+    slow = read_trace(here / report["traces"][-1]["trace"])["a"]
+    assert slow.elapsed_ns[0] == 1_000_000_000
+    assert report["traces"][-1]["timing"].startswith("constant 0.5ms, initialisation 1000 ms")
     assert report["traces"][0]["world_frames"] == report["traces"][0]["processed"] == 20
     assert report["failures"] == []
 

@@ -362,6 +362,8 @@ def test_a_forecaster_of_ones_own(tmp_path):
         ([SLOW, "--policy", "newest"], "no policy 'newest'"),
         ([SLOW, "--policy", "every:0"], "whole number from 1"),
         ([SLOW, "--latency", "constant:47"], "with its unit"),
+        ([SLOW, "--latency", "constant:47ms,init=800"], "init=800: write a time of 0 or more"),
+        ([SLOW, "--latency", "constant:47ms,int=1s"], "after a comma comes init=TIME"),
         ([SLOW, "--latency", "resample"], "whole number"),
         ([SLOW, "--latency-scale", "-2"], "below zero"),
         ([SLOW, "--convention", "mine"], "no convention 'mine'"),
@@ -445,10 +447,64 @@ def test_what_a_figure_is_not_is_said(tmp_path):
         lae_sim.Trace(lae_sim.Metadata.new("30", "every-frame"), list(trace)), plain
     )
     options = ("--forecaster", "kalman-lae-pvt")
-    assert replay_json(SLOW, *options)["traces"][0]["notes"] == []
-    [note] = replay_json(plain, *options)["traces"][0]["notes"]
+    quick = (*options, "--latency", "recorded,init=20ms")  # so that no target gets away meanwhile
+    assert replay_json(SLOW, *quick)["traces"][0]["notes"] == []
+    [note] = replay_json(plain, *quick)["traces"][0]["notes"]
     assert "does not clip forecasts where the image size is unknown" in note
     assert note in replay(plain, *options)
+
+
+NOT_MEASURED = "the trace's times: synthetic (made up, not measured)"
+
+
+@pytest.mark.parametrize(
+    ("options", "source", "words"),
+    [
+        ("--latency constant:47ms", "assumed: as a frame",
+         "initialisation costs 47 ms, the same as a frame: an assumption; name it with ,init=TIME"),
+        ("--latency constant:47ms,init=800ms", "assumed: 800 ms",
+         "initialisation costs 800 ms: an assumption"),
+        ("--latency lognormal:3,init=1s --latency-scale 2", "assumed: 1000 ms x 2",
+         "initialisation costs 2,000 ms: an assumption"),
+        ("--latency by-call,init=0s", "assumed: 0 ms", "initialisation costs 0 ms: an assumption"),
+        ("", NOT_MEASURED, f": an assumption ({NOT_MEASURED})"),
+        ("--latency bootstrap:1", NOT_MEASURED, f": an assumption ({NOT_MEASURED})"),
+    ],
+)  # fmt: skip
+def test_what_initialisation_costs_is_said(options, source, words):
+    [report] = replay_json(SLOW, *options.split(), "--per-sequence")["traces"]
+    init, rows = report["init"], report["results"][0]["per_sequence"]
+    assert init["source"] == source
+    costs = [row["init_ms"] for row in rows]
+    assert report["init_ms"] == init["mean_ms"] == pytest.approx(sum(costs) / len(costs))
+    assert (init["min_ms"], init["max_ms"]) == (min(costs), max(costs))
+    assert words in replay(SLOW, *options.split())
+
+
+def test_measured_initialisations_are_called_so(tmp_path):
+    trace = lae_sim.read_trace(SLOW)
+    timing = {"timing": {"source": "measured"}}
+    written(tmp_path / "m.parquet", list(trace), **timing)
+    assert replay_json(tmp_path / "m.parquet")["traces"][0]["init"]["source"] == "measured"
+    timed = replay_json(SLOW, "--timing", tmp_path / "m.parquet")["traces"][0]
+    assert timed["init"]["source"] == "measured"
+    assert "initialisation costs 282 ms, measured\n" in replay(tmp_path / "m.parquet")
+    noted = {"timing": {"source": "measured", "note": "initialisations are unknown"}}
+    written(tmp_path / "n.parquet", list(trace), **noted)
+    assert "the trace's times: measured; initialisations" in replay(tmp_path / "n.parquet")
+
+
+def test_a_slow_initialisation_costs_accuracy_and_names_who_gets_away():
+    fast, slow = (
+        replay_json(SLOW, "--latency", f"constant:20ms{init}")["traces"][0]
+        for init in ("", ",init=2s")
+    )
+    assert fast["init"]["left_search"] == []
+    names = slow["init"]["left_search"]
+    assert "car-occluded" in names
+    assert slow["results"][0]["auc"] < fast["results"][0]["auc"] - 0.02
+    text = " ".join(replay(SLOW, "--latency", "constant:20ms,init=2s").split())
+    assert f"around the initial box: {', '.join(names)} modelled: " in text
 
 
 def test_attributes_that_the_trace_does_not_name(tmp_path):
@@ -495,6 +551,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
             if getattr(module, name, None) is function:
                 monkeypatch.setattr(module, name, counted)
     asked = [str(SLOW), "--cost", "kalman=2ms", "--sigma", "1/2", "0", "--json"]
+    asked += ["--search", "off"]
     assert replay_command.main(asked) == 0
     plain, alone = capsys.readouterr().out, calls.copy()
     # one group of sequences: a pairing for each cost, and each forecaster once
@@ -515,5 +572,6 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     assert calls == alone
     assert {path.name for path in tmp_path.iterdir()} == set(files.values())
     calls.clear()
-    assert replay_command.main([str(SLOW), "--timeline", str(tmp_path / "timeline.svg")]) == 0
+    timeline = ["--timeline", str(tmp_path / "timeline.svg"), "--search", "off"]
+    assert replay_command.main([str(SLOW), *timeline]) == 0
     assert calls == {"simulate": 8, "pair": 1, "forecast": 2}

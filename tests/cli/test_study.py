@@ -153,6 +153,31 @@ def test_every_row_is_what_replaying_and_scoring_one_by_one_gives(tmp_path: Path
                             )
 
 
+def test_a_sweep_of_the_initialisation_is_the_single_replays(tmp_path: Path) -> None:
+    results = run(
+        tmp_path, latencies=("bootstrap", "constant:20ms"), init=("0s", "1s"), repetitions=2, seed=5
+    )
+    table = results.to_frame().set_index(["trace", "latency", "forecaster", "repetition"])
+    for latency, named in (
+        ("constant:20ms,init=1s", "constant:20ms,init=1s"),
+        ("constant:20ms,init=0s", "constant:20ms,init=0s"),
+        ("bootstrap,init=1s", "bootstrap:5:30,init=1s"),
+    ):
+        one = lae_sim.evaluate(SLOW, latency=named, sequences=FEW).to_frame()
+        expected = one[one["forecaster"] == "kalman"]["auc"].tolist()
+        found = table.loc[("synthetic-slow", latency, "kalman", 0)]
+        assert found["auc"].tolist() == pytest.approx(expected, abs=1e-12)
+        assert set(found["init_ms"]) == {0.0 if "0s" in latency else 1000.0}
+    sources = {(row.latency, row.init_source) for row in results.summary}
+    assert ("bootstrap,init=0s", "assumed: 0 ms") in sources
+    notes = results.notes()
+    assert "initialisation at bootstrap,init=1s, constant:20ms,init=1s: assumed: 1000 ms" in notes
+    lae_sim.write_report(results, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "Over time of an initialisation: policy latest" in page
+    assert "assumed: 1000 ms" in page
+
+
 def test_the_summary_has_the_means_of_replay(tmp_path: Path) -> None:
     results = run(tmp_path, sigmas=SIGMA_GRID)
     trace = lae_sim.read_trace(SLOW, FEW)

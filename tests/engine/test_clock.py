@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lae_sim.engine.clock import Clock, parse_duration, parse_fps, parse_rational
+from lae_sim.engine.clock import Clock, parse_duration, parse_fps, parse_rational, split_init
 from lae_sim.errors import LaeError
 
 
@@ -130,3 +130,42 @@ def test_no_float_loses_a_frame() -> None:
     clock = Clock.at(Fraction(30))
     assert all(i * clock.frame_ticks // clock.frame_ticks == i for i in range(20_000))
     assert sum(int((i / 30) * 30) != i for i in range(20_000)) == 404  # what floats would do
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("constant:47ms", ("constant:47ms", None)),
+        ("constant:47ms,init=800ms", ("constant:47ms", 800_000_000)),
+        ("bootstrap:1:30,init=0s", ("bootstrap:1:30", 0)),
+    ],
+)
+def test_a_time_of_the_initialisation_stands_behind_a_comma(
+    text: str, found: tuple[str, int | None]
+) -> None:
+    assert split_init(text) == split_init(text, path=True) == found
+
+
+def test_only_paths_hold_commas_of_their_own() -> None:
+    assert split_init("a,b.parquet", path=True) == ("a,b.parquet", None)
+    assert split_init("a,b.parquet,init=1s", path=True) == ("a,b.parquet", 10**9)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("constant:47ms,init=", "init=: write a time of 0 or more, as init=800ms"),
+        ("constant:47ms,init=-1s", "init=-1s: write a time of 0 or more"),
+        ("constant:47ms,init=800", "init=800: write a time of 0 or more"),
+        ("constant:47ms,init=1s,init=2s", "init stands twice"),
+        ("constant:47ms,int=1s", "no 'int=1s' here: after a comma comes init=TIME, as init=800ms"),
+        ("constant:47ms,800ms", "no '800ms' here: after a comma comes init=TIME"),
+        ("constant:47ms,init=1s,x", "init=1s,x: write a time of 0 or more"),
+        ("constant:47ms,", "no '' here"),
+    ],
+)
+def test_what_else_stands_behind_a_comma_is_an_error(text: str, said: str) -> None:
+    with pytest.raises(LaeError) as caught:
+        split_init(text)
+    assert said in str(caught.value)
+    assert repr(text) in str(caught.value)

@@ -25,9 +25,10 @@ from witness import (
 )
 
 from lae_sim.boxes import iou
-from lae_sim.engine.clock import Clock
+from lae_sim.engine.clock import Clock, parse_duration
 from lae_sim.engine.policies import vot_realtime
 from lae_sim.errors import LaeError
+from lae_sim.evaluation.caveats import left_search, notes_on
 from lae_sim.evaluation.evaluate import (
     Evaluation,
     ScoredRun,
@@ -39,7 +40,7 @@ from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, PYSOT, precision_cu
 from lae_sim.evaluation.pairing import pair
 from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
-from lae_sim.replay.latency import constant
+from lae_sim.replay.latency import LatencySource, by_frame, constant, initialised
 from lae_sim.replay.run import Run, replay_sequence
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.trace.metadata import Metadata
@@ -381,3 +382,56 @@ def test_tiny_and_huge_boxes_are_scored_without_a_warning(size: float) -> None:
     found = evaluate_runs([replay_sequence(recording, CLOCK)], metadata, FORECASTERS, SIGMA_GRID)
     for metric in METRICS:
         assert ((found.scores[metric] >= 0) & (found.scores[metric] <= 1)).all()
+
+
+# ------------------------------------------------- targets that leave during the initialisation
+
+
+def leaving(name: str, *, speed: float, size: float = 10.0, at: int = 0) -> Recording:
+    """A square target that moves by so many pixels a frame from a frame on."""
+    x = speed * np.maximum(np.arange(40) - at, 0.0)
+    boxes = np.stack([x, np.zeros(40), *np.full((2, 40), size)], axis=1)
+    return Recording.new(name, boxes, boxes, np.full(40, 10**7))
+
+
+def left(init: str, *recordings: Recording, source: LatencySource = by_frame) -> list[str]:
+    timed = initialised(source, parse_duration(init))
+    runs = [replay_sequence(each, CLOCK, timed) for each in recordings]
+    return left_search(evaluate_runs(runs, EVERY, {"hold": Hold}).replay)
+
+
+def test_the_target_has_left_once_it_is_a_search_regions_half_side_away() -> None:
+    # a = sqrt((10 + 10)(10 + 10)) = 20 px: at 2 px a frame, frame 10 is the first beyond reach
+    steady, large = leaving("steady", speed=2), leaving("large", speed=2, size=20)
+    assert left("320ms", steady, large) == []
+    assert left("333333333ns", steady, large) == []  # frame 9 is still the latest
+    assert left("333333334ns", steady, large) == ["steady"]
+    assert left("700ms", steady, large) == ["steady", "large"]
+
+
+def test_who_misses_no_frame_or_sees_no_other_loses_nobody() -> None:
+    fast = leaving("fast", speed=100)
+    assert left("30ms", fast) == []  # frame 1 is next, however fast the target is
+    assert left("34ms", fast) == []
+    assert left("67ms", fast) == ["fast"]
+    assert left("100s", fast) == []
+    assert left("1s", leaving("late", speed=100, at=30)) == []
+    assert left("1s", leaving("late", speed=100, at=29)) == ["late"]
+
+
+def test_where_there_is_no_truth_nothing_is_known_to_have_left() -> None:
+    unseen, sizeless = leaving("unseen", speed=9), leaving("sizeless", speed=9, size=0)
+    truth = unseen.truth.copy()
+    truth[30] = np.nan
+    unseen = replace(unseen, truth=truth)
+    assert left("1s", unseen, sizeless) == []
+    assert left("900ms", unseen, sizeless) == ["unseen"]
+
+
+def test_each_sequence_whose_target_leaves_is_named() -> None:
+    recordings = [leaving(f"s{speed}", speed=speed) for speed in range(4)]
+    runs = [replay_sequence(each, CLOCK, initialised(by_frame, 10**9)) for each in recordings]
+    found = evaluate_runs(runs, EVERY, {"hold": Hold}).replay
+    [note] = notes_on(found, EVERY, PYSOT, {"hold": Hold})
+    assert "initialisation (1,000 ms) ends so late in 3 of 4 sequences" in note
+    assert note.endswith(": s1, s2, s3")

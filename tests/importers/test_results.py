@@ -295,9 +295,34 @@ def test_given_times(text, source, ns):
     assert (given.source, given.of("a", 3)) == (source, ns)
 
 
+def test_given_times_may_tell_the_initialisation_apart(tmp_path):
+    path = tmp_path / "of,all.csv"
+    write(path, "sequence,fps\na,300\n")
+    for text, source, ns in (
+        ("constant:47ms", "constant 47 ms, initialisation 800 ms, not measured", 47_000_000),
+        (
+            "mean-fps:120.3",
+            "mean fps 120.3 given, initialisation 800 ms, not measured per frame",
+            8_312_552,
+        ),
+        (
+            f"mean-fps:{path}",
+            "mean fps of each sequence from of,all.csv, initialisation 800 ms, not measured per "
+            "frame",
+            3_333_333,
+        ),
+    ):
+        given = given_times(f"{text},init=0.8s", "any")
+        assert (given.source, given.of("a", 3)) == (source, ns)
+        assert given.init_ns == 800_000_000
+        assert given_times(text, "any").init_ns is None
+
+
 def test_measured_times_are_not_given():
     assert given_times("measured", "any") is None
-    for text in ("constant:47", "constant:", "mean-fps:0", "mean-fps:", "fast", "measured:1"):
+    for text in ("constant:47", "constant:", "mean-fps:0", "mean-fps:", "fast", "measured:1",
+                 "constant:47ms,init=", "constant:47ms,800ms", "mean-fps:120,init=-1s",
+                 "mean-fps:120,30"):  # fmt: skip
         with pytest.raises(LaeError):
             given_times(text, "any")
 

@@ -26,11 +26,13 @@ from lae_sim.replay.latency import (
     by_call,
     by_frame,
     constant,
+    initialised,
     lognormal,
     resampled,
     scaled,
 )
 from lae_sim.replay.run import replay_sequence
+from lae_sim.replay.world import label_of
 from lae_sim.trace.recording import Recording
 
 TIMES = [90, -1, 20, 30, -1, 50]
@@ -144,6 +146,69 @@ def test_a_factor_below_zero_is_refused() -> None:
 def test_scaling_keeps_the_message_of_its_source() -> None:
     with pytest.raises(LaeError, match="frame 1"):
         scaled(by_frame, Fraction(2))(recording(TIMES))(1)
+
+
+# ----------------------------------------------------------------------------- initialisation
+
+ANY = pytest.mark.parametrize("source", [by_call, constant(ns=7), resampled(1), lognormal(1)])
+
+
+@ANY
+def test_the_initialisation_alone_has_a_time_of_its_own(source: LatencySource) -> None:
+    plain = draws(source, 4)
+    assert draws(initialised(source, 800), 4) == [800, *plain[1:]]
+    assert draws(source, 4) == plain  # what the source gives is not changed
+
+
+def test_the_initialisation_by_frame_is_that_of_frame_0() -> None:
+    service = initialised(by_frame, 800)(recording(TIMES))
+    assert [service(frame) for frame in (0, 2, 5)] == [800, 20, 50]
+    with pytest.raises(LaeError, match="frame 4"):
+        service(4)
+
+
+def test_a_source_that_counts_its_calls_is_asked_for_the_initialisation_too() -> None:
+    def counting(recording: Recording) -> Callable[[int], int]:
+        times = iter(range(10))
+        return lambda frame: next(times)
+
+    assert draws(initialised(counting, 800), 4) == [800, 1, 2, 3]
+
+
+@ANY
+def test_a_scale_outside_multiplies_the_initialisation_and_one_inside_does_not(
+    source: LatencySource,
+) -> None:
+    half = scaled(source, Fraction(1, 2))
+    assert draws(scaled(initialised(source, 801), Fraction(1, 2)), 4) == [400, *draws(half, 4)[1:]]
+    assert draws(initialised(half, 801), 4) == [801, *draws(half, 4)[1:]]
+
+
+def test_a_constant_may_tell_the_initialisation_apart() -> None:
+    for source in (constant("47ns", init="800ns"), constant(ns=47, init_ns=800)):
+        assert draws(source, 3) == [800, 47, 47]
+        assert label_of(source) == "constant:47ns,init=800ns"
+    assert label_of(constant("47ms", init="1s")) == "constant:47ms,init=1000ms"
+    assert constant("1s", init="2s") == constant("1000ms", init="2s") != constant("1s", init="3s")
+
+
+def test_a_wrong_time_of_the_initialisation() -> None:
+    with pytest.raises(LaeError, match="negative"):
+        initialised(by_frame, -1)
+    with pytest.raises(LaeError, match="give a duration as text with its unit"):
+        constant("47ms", init="1s", init_ns=1)
+    with pytest.raises(LaeError, match="'800' is not a duration"):
+        constant("47ms", init="800")
+
+
+def test_random_times_with_an_initialisation_can_be_repeated() -> None:
+    source = scaled(initialised(lognormal(3), 800), Fraction(2))
+    assert isinstance(source, RandomSource)
+    once = recording(TIMES, length=20)
+    repeated, plain = source.repeated(once, 0, 5), scaled(lognormal(3), Fraction(2))
+    assert set(repeated[:, 0].tolist()) == {1600}
+    assert isinstance(plain, RandomSource)
+    np.testing.assert_array_equal(repeated[:, 1:], plain.repeated(once, 0, 5)[:, 1:])
 
 
 # ------------------------------------------------------------------------------ random sources

@@ -51,6 +51,24 @@ def test_the_grid_of_sigmas_has_a_name() -> None:
     assert Study.of({"traces": "a", "sigma": "grid"}).sigmas == SIGMA_GRID
 
 
+def test_every_latency_is_crossed_with_every_time_of_the_initialisation() -> None:
+    study = Study.of(
+        {"traces": "a", "latencies": ["bootstrap", "constant:47ms"], "init": ["300ms", "1s"],
+         "seed": 5, "block": 7}
+    )  # fmt: skip
+    assert study.times == (
+        "bootstrap,init=300ms", "bootstrap,init=1s",
+        "constant:47ms,init=300ms", "constant:47ms,init=1s",
+    )  # fmt: skip
+    assert [study.seeded(each) for each in study.times[1:3]] == [
+        "bootstrap:5:7,init=1s", "constant:47ms,init=300ms",
+    ]  # fmt: skip
+    assert Study(("a",), init="1s").times == ("recorded,init=1s",)  # type: ignore[arg-type]
+    alone = Study(("a",), latencies=("resample,init=1s", "recorded"))
+    assert alone.times == alone.latencies
+    assert [alone.seeded(each) for each in alone.times] == ["resample:0,init=1s", "recorded"]
+
+
 def test_a_study_survives_its_document() -> None:
     study = Study.of({"traces": "a", "scales": ["1/3"], "latencies": ["bootstrap"], "block": 5})
     document = study.document()
@@ -72,6 +90,15 @@ def test_a_study_survives_its_document() -> None:
         ('traces = "a"\nfps = [0]', "fps: a frame rate must be above zero"),
         ('traces = "a"\nlatencies = ["47ms"]', "latencies: no latency '47ms'"),
         ('traces = "a"\nlatencies = ["bootstrap:3"]', "in a study the keys seed and block say so"),
+        ('traces = "a"\ninit = ["800"]', "init: '800' is not a duration"),
+        ('traces = "a"\ninit = [1]', "init: 1 is not a duration"),
+        ('traces = "a"\ninit = []', "init: the list is empty"),
+        ('traces = "a"\nlatencies = ["recorded,int=1s"]', "latencies: 'recorded,int=1s': no "),
+        (
+            'traces = "a"\nlatencies = ["recorded,init=1s"]\ninit = ["1s"]',
+            "latencies: 'recorded,init=1s' names its init, and so does the key init",
+        ),
+        ('traces = "a"\nlatencies = ["bootstrap:3,init=1s"]', "in a study the keys seed and"),
         ('traces = "a"\npolicies = ["last"]', "no policy 'last'"),
         ('traces = "a"\npolicies = ["vot-realtime"]', "never scores latency"),
         ('traces = "a"\nconventions = ["pysott"]', "no convention 'pysott'"),

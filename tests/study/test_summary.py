@@ -40,6 +40,8 @@ def summary_row(**values):
         exact=True,
         approximate_share=0.0,
         elapsed_ms=None,
+        init_ms=80.0,
+        init_source="measured",
         skip_rate=0.5,
         sigma=Fraction(1, 50),
         scores={"auc": 0.5, "dp20": None},
@@ -51,7 +53,7 @@ def summary_row(**values):
 HEAD = [
     "trace", "tracker", "dataset", "device", "times_from", "policy", "fps", "latency", "scale",
     "convention", "forecaster", "sequences", "repetitions", "engine", "exact",
-    "approximate_share", "elapsed_ms", "skip_rate", "sigma",
+    "approximate_share", "elapsed_ms", "init_ms", "init_source", "skip_rate", "sigma",
     "auc", "dp20", "offline_auc", "offline_dp20",
 ]  # fmt: skip
 
