@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.boxes import iou, search_side
+from lae_sim.boxes import iou, search_distance
 from lae_sim.errors import LaeError
 from lae_sim.trace.file import Trace
 from lae_sim.trace.recording import Recording
@@ -238,13 +238,9 @@ def _logistic(z: Floats) -> Floats:
 
 def _distance(recording: Recording, gap: int) -> float:
     """How far the target moved from the start, in units of its search side; NaN if unknown."""
-    before, after = recording.truth[0], recording.truth[gap]
-    if not (np.isfinite(before).all() and np.isfinite(after).all()):
-        return np.nan
-    if (before[2:] <= 0).any() or (after[2:] <= 0).any():
-        return np.nan
-    apart = after[:2] + after[2:] / 2 - before[:2] - before[2:] / 2
-    return float(np.abs(apart).max() / search_side(before))
+    before, after = recording.truth[:1], recording.truth[gap : gap + 1]
+    has_size = (after[:, 2:] > 0).all()
+    return float(search_distance(before, after)[0]) if has_size else np.nan
 
 
 def _restarted(trace: Trace) -> Iterator[tuple[RestartName, Recording]]:
