@@ -84,7 +84,7 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     summary, spreads = summarise_closed_loops(rows), closed_loop_spreads(rows)
     overall, verdicts = summarise_replays(rows), fidelity_verdicts(rows, spreads)
     if arguments.plot:
-        from lae_sim.report.fidelity_figure import fidelity_figure
+        from lae_sim.report.figures import fidelity_figure
         from lae_sim.report.style import save
 
         save(fidelity_figure(rows, "Replays against closed loops"), arguments.plot)

@@ -1,6 +1,11 @@
 from .comparison import comparison_table, fidelity_verdicts
-from .fidelity_figure import fidelity_figure
-from .figures import draw_curves, success_and_precision, sweep_figure, timeline_figure
+from .figures import (
+    draw_curves,
+    fidelity_figure,
+    success_and_precision,
+    sweep_figure,
+    timeline_figure,
+)
 from .film import Scene, draw_frame, film_strip
 from .page import write_report
 from .reach import ReachReport, reach_figure
