@@ -54,6 +54,7 @@ RANDOM = {"jitter38": "constant:40ms", "jitter50": "constant:47ms"}
 """Lognormal times around these milliseconds, and the constant time whose repetitions are theirs."""
 SEARCHED = (*CONSTANT[0::3], *INIT[:2])
 """The times of closed loops with a pre-forecaster: 20, 47 and 100 ms, and long initialisations."""
+GROUPS = ("bare", "constant", "init", "random", "pre-forecaster", "pre-forecaster, size kept")
 KINDS = ("every-frame", "strided", "modelled")
 
 _LOGNORMAL, _REPEATED, _SEEDS = 0.25, 0.02, 3
@@ -139,6 +140,11 @@ class Run:
     def row(self) -> FidelityRow:
         """Of the modelled replay."""
         return self.rows["modelled"]
+
+    @property
+    def group(self) -> str:
+        """The group of the closed loop, said more precisely."""
+        return self.loop.group + (", size kept" if self.keep_size else "")
 
     @property
     def approximate(self) -> bool:
@@ -234,7 +240,10 @@ def outside(run: Run, metric: str) -> float:
 
 
 def fitted(runs: Sequence[Run], metric: str) -> dict[str, float]:
-    """What is unexplained of each sequence's score, fitted on the others; of ``""``, on all."""
+    """What is unexplained of each sequence's score, fitted on the others; of ``""``, on all.
+
+    Exact replays say nothing of it.
+    """
     approximate = [run for run in runs if run.approximate]
     distance = np.array([outside(run, metric) for run in approximate])
     of = np.array([run.row.sequence for run in approximate])
@@ -284,18 +293,19 @@ def _mean(values: Iterable[float]) -> float | None:
 def summary(runs: Sequence[Run]) -> dict[str, Any]:
     """The figures by tracker, forecaster and group of closed loops, and what is unexplained."""
     apart = spreads(runs)
-    rest = {metric: fitted(runs, metric) for metric in MODELLED}
+    bare = [run for run in runs if run.keep_size is None]
+    rest = {metric: fitted(bare, metric) for metric in MODELLED}
     scored = [run for run in runs if not run.loop.repeat]
     trackers = list(dict.fromkeys(run.tracker for run in scored))
     lines = []
     for tracker, forecaster in [(t, f) for t in [*trackers, "all"] for f in ("hold", "kalman")]:
-        for group in ("all", "constant", "init", "random", "pre-forecaster"):
+        for group in GROUPS:
             some = [
                 run
                 for run in scored
                 if tracker in (run.tracker, "all")
                 and run.row.forecaster == forecaster
-                and (group == run.loop.group or (group == "all" and run.keep_size is None))
+                and (group == run.group or (group == "bare" and run.keep_size is None))
             ]
             if some and (tracker != "all" or len(trackers) > 1):
                 head = {"tracker": tracker, "forecaster": forecaster, "closed loops": group}
