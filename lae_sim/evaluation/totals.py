@@ -149,6 +149,7 @@ class ModelledTotals:
         """With the index of the forecaster that others are to do better than."""
         self.known: bool | None = None
         self.applies = 0
+        self._unexplained: Mapping[str, float] = {}
         self._hold = hold
         self._draws: dict[str, list[Floats]] = {metric: [] for metric in MODELLED}
         self._scores = {metric: Mean() for metric in MODELLED}
@@ -159,7 +160,8 @@ class ModelledTotals:
     def add(self, part: Evaluation) -> None:
         """Add the sequences of a part."""
         modelled, outputs = part.modelled, part.replay.processed
-        self.known = modelled.known if self.known is None else self.known
+        if self.known is None:
+            self.known, self._unexplained = modelled.known, modelled.unexplained
         self.applies += int(modelled.applies.sum())
         self._outputs += float(outputs.sum())
         self._lost_outputs += float(modelled.lost_share @ outputs)
@@ -186,7 +188,7 @@ class ModelledTotals:
     def interval(self, metric: str) -> tuple[Floats, Floats]:
         """The low and the high end of the mean scores, each float64 [F, M]."""
         (draws,) = self._draws[metric]
-        return interval(draws, metric, bool(self.known), self.applies)
+        return interval(draws, bool(self.known), self._unexplained[metric], self.applies)
 
     def recovered(self, metric: str) -> tuple[Floats, Floats]:
         """How much better than hold, and how much better the offline scores are, [F, M] each."""

@@ -26,7 +26,7 @@ from math import ceil, inf, log
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.boxes import iou, search_distance, search_side
+from lae_sim.boxes import iou, search_distance, search_region, search_side
 from lae_sim.errors import LaeError
 from lae_sim.forecast.base import AnyFactory, Forecaster, ImageSize, factory_for
 from lae_sim.replay.reach import (
@@ -169,6 +169,7 @@ class SearchModel:
             np.array([lost for _, lost in found.values()]),
             np.stack(list(weights.values()), axis=1),
             self.known,
+            self.pre_forecaster is not None,
         )
 
     def _walker(
@@ -186,7 +187,9 @@ class SearchModel:
 
         def walk(reach: float) -> tuple[Floats, Bools, float]:
             forecaster = factory(answers.boxes[0].tolist(), image_size)
-            return _forecast_walk(frames, answers, resumed, reach, forecaster, self.keep_size)
+            return _forecast_walk(
+                frames, answers, resumed, reach, forecaster, self.keep_size, image_size
+            )
 
         return walk
 
@@ -214,12 +217,14 @@ class Outcomes:
         weights: how likely each is, float64 [1, R]; where the reach is not ``known`` a row for the
             low end, the middle and the high end of its range, float64 [3, R]. Rows add up to 1.
         known: whether the reach is.
+        forecast: whether a pre-forecaster said where to search.
     """
 
     boxes: tuple[Floats, ...]
     lost_share: Floats
     weights: Floats
     known: bool
+    forecast: bool = False
 
     @property
     def likeliest(self) -> Floats:
@@ -249,6 +254,7 @@ class _Walk:
         fails = np.flatnonzero(out) + 1
         k, found = self._resumed
         source[1:k] = 0
+        k += found  # that output is as recorded, whatever the reach
         while k < n:
             if found:
                 at = int(np.searchsorted(fails, k))
@@ -273,22 +279,27 @@ def _forecast_walk(
     reach: float,
     forecaster: Forecaster,
     keep_size: bool,
+    image_size: ImageSize,
 ) -> tuple[Floats, Bools, float]:
     """The run of a tracker that searches where a pre-forecaster says; every call is tested."""
     rows = answers.boxes.tolist()
     answered, lost = [rows[0]], [False]
     same_to = inf
+    resumed_at, found = resumed
     for k, (frame, box) in enumerate(zip(frames[1:].tolist(), rows[1:]), 1):
-        x, y, w, h = map(float, forecaster.predict(frame))
+        x, y, w, h = forecaster.predict(frame)
         if keep_size:
             *_, last_w, last_h = answered[-1]
             x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
-        offset = max(abs(box[0] + box[2] / 2 - x - w / 2), abs(box[1] + box[3] / 2 - y - h / 2))
-        side = max(search_side(np.array([x, y, w, h])).item(), _TINY)
-        missed = k < resumed[0] or not offset < reach * side
-        if missed and k >= resumed[0]:
-            same_to = min(same_to, offset / side)
-        answered.append([x, y, w, h] if missed else box)
+        centre_x, centre_y, w, h = search_region([x, y, w, h], image_size)
+        missed = k < resumed_at
+        if k > resumed_at or (k == resumed_at and not found):
+            offset = max(abs(box[0] + box[2] / 2 - centre_x), abs(box[1] + box[3] / 2 - centre_y))
+            side = search_side(np.array([0.0, 0.0, w, h])).item()
+            missed = not offset < reach * side
+            if missed:
+                same_to = min(same_to, offset / side)
+        answered.append([centre_x - w / 2, centre_y - h / 2, w, h] if missed else box)
         lost.append(missed)
         forecaster.update(frame, answered[-1])
     return np.array(answered), np.array(lost), same_to * (1 - 1e-12)
@@ -307,24 +318,25 @@ def _within(reaches: Floats, recording: Recording, jumps: Sequence[OwnJump]) -> 
 
 
 def _resumed(recording: Recording, frames: Ints, jumps: Sequence[OwnJump]) -> tuple[int, bool]:
-    """The output from which on the reach decides, and whether the target is found before it.
+    """The output up to which a sequence's own jump says all, and whether it is found there.
 
     Where a sequence was seen to jump from its initialisation about as far as the first output does,
-    it is known from which frame on the tracker finds the target again, or how long it does not.
+    it is known when the tracker finds the target again, or how long it does not. Before that output
+    it is lost; without such a jump that is before the first, and the reach decides of all.
     """
     if len(frames) < 2:
-        return 1, True
+        return 0, True
     first = int(frames[1])
     alike = [(abs(log(jump.gap / first)), jump) for jump in jumps if first > 2]
     alike = [each for each in alike if each[0] < _AS_LARGE]
     if not alike:
-        return 1, True
+        return 0, True
     jump = min(alike, key=lambda each: (each[0], each[1].gap))[1]
     _, after = _outcome(recording, jump)
     if after is None:  # not while it was followed
         followed = int(jump.frames[-1]) - jump.gap
         return int(np.searchsorted(frames, first + followed, "right")), False
-    return int(np.searchsorted(frames, first + after)) + 1, True
+    return int(np.searchsorted(frames, first + after)), True
 
 
 def _recorded(recording: Recording, jump: OwnJump) -> bool:

@@ -141,9 +141,12 @@ def test_nothing_is_trained_on_what_it_is_scored_on(slow: Trace, fast: Trace) ->
 def test_notes_say_what_is_approximate(slow: Trace) -> None:
     worlds = World.sweep(latency=["constant:1ms", "constant:90ms"])
     notes = score_forecasters({"slow": slow}, {}, worlds).attrs["notes"]
+    assumed = "ms, the same as a frame: an assumption; name it with ,init=TIME"
     assert notes == [
+        f"slow, constant:1ms: initialisation costs 1 {assumed}",
+        f"slow, constant:90ms: initialisation costs 90 {assumed}",
         "slow, constant:90ms: approximate, 100% of the outputs follow another frame than when "
-        "recorded"
+        "recorded",
     ]
 
 
