@@ -23,7 +23,8 @@ examples:
   lae-sim fidelity t.parquet --strided t.stride3-2.parquet t.stride2.parquet t.stride3.parquet \\
       --closed-loop t.closed-loop-47ms.parquet t.closed-loop-100ms.parquet --per-sequence
   lae-sim fidelity dtb70.parquet uavdt.parquet --strided *.stride*.parquet *.gaps.parquet \\
-      --closed-loop *.closed-loop-*.parquet      each goes with the trace of its tracker and dataset
+      --closed-loop *.closed-loop-*.parquet --plot fidelity.png    each closed loop goes with the
+                                                                   trace of its tracker and dataset
 
 closed loops of one trace whose times, policy and pre-forecaster are alike (mean times of a call
 within 5 %, of an initialisation within 10 %) are repetitions, whose own spread is reported.
@@ -43,6 +44,7 @@ def parser() -> argparse.ArgumentParser:
     add_search(made, pre_forecaster=False)
     add("--per-sequence", action="store_true", help="report each sequence")
     add("--json", action="store_true", help="print one JSON object instead of tables")
+    add("--plot", metavar="FILE", help="draw replays over closed loops (.png, .svg, .pdf)")
     return made
 
 
@@ -64,6 +66,13 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     )
     from lae_sim.report.comparison import fidelity_table, fidelity_verdicts, spread_table
 
+    if arguments.plot:
+        from lae_sim.files import check_distinct
+        from lae_sim.report.style import check_format
+
+        check_format(arguments.plot)
+        inputs = [*arguments.traces, *arguments.closed_loop, *arguments.strided]
+        check_distinct([arguments.plot], inputs)
     rows = compare_closed_loops(
         arguments.traces,
         arguments.closed_loop,
@@ -74,6 +83,11 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     )
     summary, spreads = summarise_closed_loops(rows), closed_loop_spreads(rows)
     overall, verdicts = summarise_replays(rows), fidelity_verdicts(rows, spreads)
+    if arguments.plot:
+        from lae_sim.report.fidelity_figure import fidelity_figure
+        from lae_sim.report.style import save
+
+        save(fidelity_figure(rows, "Replays against closed loops"), arguments.plot)
     if arguments.json:
         first, *_ = arguments.traces
         head = {"format": "lae-fidelity", "version": "1.0", "lae_sim": __version__}
