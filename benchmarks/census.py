@@ -11,8 +11,9 @@ same setting, with 2 % of jitter on the times), how many closed loops the model'
 and how wide they are.
 
 What the model leaves unexplained (``UNEXPLAINED`` in :mod:`lae_sim.evaluation.modelled`) is fitted
-here, for each sequence on all others: the .95 quantile of how far closed loops lie outside of what
-reaches and phases span. The values over all sequences are what the module should have.
+here, for each sequence on all others: a quantile (.95, with a pre-forecaster .9) of how far closed
+loops lie outside of what reaches and phases span. The values over all sequences are what the module
+should have.
 
 It takes some 50 runs of a tracker through all frames; what is finished is kept in ``--out``, and
 gone on with where it was interrupted.
@@ -37,7 +38,7 @@ from lae_sim.datasets.frames import Dataset
 from lae_sim.datasets.layouts import find_dataset
 from lae_sim.engine.clock import parse_duration
 from lae_sim.errors import LaeError
-from lae_sim.evaluation.modelled import LEVEL, MODELLED, UNEXPLAINED
+from lae_sim.evaluation.modelled import MODELLED, UNEXPLAINED, UNEXPLAINED_FORECAST
 from lae_sim.files import text_digest
 from lae_sim.plugins import key_and_value, parse_options
 from lae_sim.profile.run import profile_tracker
@@ -54,6 +55,9 @@ RANDOM = {"jitter38": "constant:40ms", "jitter50": "constant:47ms"}
 """Lognormal times around these milliseconds, and the constant time whose repetitions are theirs."""
 SEARCHED = (*CONSTANT[0::3], *INIT[:2])
 """The times of closed loops with a pre-forecaster: 20, 47 and 100 ms, and long initialisations."""
+GROUPS = ("bare", "constant", "init", "random", "pre-forecaster", "pre-forecaster, size kept")
+LEVELS = {"bare": 0.95, "pre-forecaster": 0.9}
+"""How many of the closed loops that say what is unexplained are to be inside."""
 KINDS = ("every-frame", "strided", "modelled")
 
 _LOGNORMAL, _REPEATED, _SEEDS = 0.25, 0.02, 3
@@ -139,6 +143,16 @@ class Run:
     def row(self) -> FidelityRow:
         """Of the modelled replay."""
         return self.rows["modelled"]
+
+    @property
+    def group(self) -> str:
+        """The group of the closed loop, said more precisely."""
+        return self.loop.group + (", size kept" if self.keep_size else "")
+
+    @property
+    def unexplained(self) -> Mapping[str, float]:
+        """What its intervals hold for what the model does not explain."""
+        return UNEXPLAINED if self.keep_size is None else UNEXPLAINED_FORECAST
 
     @property
     def approximate(self) -> bool:
@@ -227,22 +241,26 @@ def _place(run: Run) -> tuple[str, ...]:
 def outside(run: Run, metric: str) -> float:
     """How far a closed loop is outside of what reaches and phases span."""
     low, high = getattr(run.row, f"{metric}_low"), getattr(run.row, f"{metric}_high")
-    closed, rest = getattr(run.row, f"closed_{metric}"), UNEXPLAINED[metric]
+    closed, rest = getattr(run.row, f"closed_{metric}"), run.unexplained[metric]
     below = low + rest - closed if low > 0 else 0.0  # at 0 and 1 the interval was cut
     above = closed - high + rest if high < 1 else 0.0
     return max(below, above, 0.0)
 
 
-def fitted(runs: Sequence[Run], metric: str) -> dict[str, float]:
-    """What is unexplained of each sequence's score, fitted on the others; of ``""``, on all."""
+def fitted(runs: Sequence[Run], metric: str, level: float) -> dict[str, float]:
+    """What is unexplained of each sequence's score, fitted on the others; of ``""``, on all.
+
+    Exact replays say nothing of it.
+    """
     approximate = [run for run in runs if run.approximate]
     distance = np.array([outside(run, metric) for run in approximate])
     of = np.array([run.row.sequence for run in approximate])
     others = {name: of != name for name in dict.fromkeys(of.tolist())}
     others[""] = np.ones(len(of), bool)
     return {
-        name: float(np.quantile(distance[which], LEVEL)) if which.any() else UNEXPLAINED[metric]
+        name: float(np.quantile(distance[which], level))
         for name, which in others.items()
+        if which.any()
     }
 
 
@@ -261,17 +279,16 @@ def figures(
     found["covered"] = _mean(bool(run.row.covered) for run in runs)
     found["approximate"] = len(approximate)
     found["approximate covered"] = _mean(bool(run.row.covered) for run in approximate)
-    found["width"] = _mean(_width(run, UNEXPLAINED["auc"]) for run in approximate)
-    found["fitted covered"] = _mean(
-        outside(run, "auc") <= rest[run.row.sequence] for run in approximate
-    )
-    found["fitted width"] = _mean(_width(run, rest[run.row.sequence]) for run in approximate)
+    found["width"] = _mean(_width(run, run.unexplained["auc"]) for run in approximate)
+    known = [(run, rest[run.row.sequence]) for run in approximate if run.row.sequence in rest]
+    found["fitted covered"] = _mean(outside(run, "auc") <= value for run, value in known)
+    found["fitted width"] = _mean(_width(run, value) for run, value in known)
     return found
 
 
 def _width(run: Run, rest: float) -> float:
     """The width of an interval with so much unexplained on either side."""
-    more = rest - UNEXPLAINED["auc"]
+    more = rest - run.unexplained["auc"]
     low, high = run.row.auc_low or 0.0, run.row.auc_high or 0.0
     return min(high + more, 1.0) - max(low - more, 0.0)
 
@@ -284,22 +301,26 @@ def _mean(values: Iterable[float]) -> float | None:
 def summary(runs: Sequence[Run]) -> dict[str, Any]:
     """The figures by tracker, forecaster and group of closed loops, and what is unexplained."""
     apart = spreads(runs)
-    rest = {metric: fitted(runs, metric) for metric in MODELLED}
+    rest: dict[str, dict[str, dict[str, float]]] = {}
+    for name, level in LEVELS.items():
+        some = [run for run in runs if (run.keep_size is None) == (name == "bare")]
+        rest[name] = {metric: fitted(some, metric, level) for metric in MODELLED} if some else {}
     scored = [run for run in runs if not run.loop.repeat]
     trackers = list(dict.fromkeys(run.tracker for run in scored))
     lines = []
     for tracker, forecaster in [(t, f) for t in [*trackers, "all"] for f in ("hold", "kalman")]:
-        for group in ("all", "constant", "init", "random", "pre-forecaster"):
+        for group in GROUPS:
             some = [
                 run
                 for run in scored
                 if tracker in (run.tracker, "all")
                 and run.row.forecaster == forecaster
-                and (group == run.loop.group or (group == "all" and run.keep_size is None))
+                and (group == run.group or (group == "bare" and run.keep_size is None))
             ]
             if some and (tracker != "all" or len(trackers) > 1):
                 head = {"tracker": tracker, "forecaster": forecaster, "closed loops": group}
-                lines.append({**head, **figures(some, apart, rest["auc"])})
+                of = rest["pre-forecaster" if group.startswith("pre") else "bare"]
+                lines.append({**head, **figures(some, apart, of["auc"])})
     worst: dict[str, float] = {}
     for (tracker, _, sequence, *_), value in apart.items():
         key = f"{tracker} {sequence}"
@@ -324,12 +345,13 @@ def printed(found: Mapping[str, Any]) -> Iterator[str]:
     ]
     yield text_of(Table.of(columns, found["figures"]))
     yield ""
-    for metric, values in found["unexplained"].items():
-        others = ", ".join(f"{name} {value:.4f}" for name, value in values.items() if name)
-        yield (
-            f"unexplained of {metric}: {values['']:.4f} over all (now {UNEXPLAINED[metric]:g}); "
-            f"without {others}"
-        )
+    for name, by_metric in found["unexplained"].items():
+        for metric, values in by_metric.items():
+            others = ", ".join(f"{of} {value:.4f}" for of, value in values.items() if of)
+            yield (
+                f"unexplained of {metric}, {name}: {values.get('', 0.0):.4f} over all; "
+                f"without {others}"
+            )
     lucky = [f"{k} {v:.3f}" for k, v in found["repeated within"].items() if v > REPEATED_WITHIN]
     yield f"closed loops of one setting are up to so far apart: {', '.join(lucky) or 'none'}"
 

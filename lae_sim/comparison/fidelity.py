@@ -200,11 +200,11 @@ def compare_closed_loops(
         closed = read_trace(path)
         of = _replayed_for(path, closed, replayed)
         schedule = closed.metadata.document["schedule"]
-        searching = (None, False)
-        if _difference(closed, of.trace, _SEARCH):
-            searching = schedule["pre_forecaster"], bool(schedule.get("keep_size"))
         setting = _setting(closed, settings.setdefault(of.path, []))
-        rows += _rows(path, closed, of, setting, model(of, *searching), factories, convention)
+        stands_in = _searched(closed) and not _searched(of.trace)
+        pre_forecaster = schedule["pre_forecaster"] if stands_in else None
+        searches = model(of, pre_forecaster, stands_in and bool(schedule.get("keep_size")))
+        rows += _rows(path, closed, of, setting, searches, factories, convention)
     return rows
 
 

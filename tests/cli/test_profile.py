@@ -370,9 +370,9 @@ def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
         for row in json.loads(out)["summary"]
         if row["forecaster"] == "hold"
     }
-    assert len(rows) == 6
+    assert len(rows) == 9
     # at 20 ms nothing is skipped, and every third frame is a pass of its own
-    for replay in ("every-frame", "strided"):
+    for replay in ("every-frame", "strided", "modelled"):
         assert rows["t.closed-loop-20ms.parquet", replay]["max_abs_d_auc"] == 0
     assert rows["t.closed-loop-100ms.parquet", "strided"]["max_abs_d_auc"] == 0
     # a target that goes 9 pixels in three frames is lost by a tracker that reaches 8
@@ -381,6 +381,7 @@ def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     assert "strided" in out
+    assert out.splitlines()[-1].startswith("Modelled replays of bright are within 0.")
     passes = ("--strided", "t.stride2.parquet", "t.stride3.parquet")
     slow = ("--latency", "constant:47ms", "--json", "--per-sequence")
     process = start(here, "t.parquet", *passes, *slow, module="replay")

@@ -73,8 +73,9 @@ def test_passes_progress_and_closed_loops(tmp_path: Path) -> None:
     assert (closed.timing, closed.schedule["kind"]) == ("constant 100ms, not measured", "real-time")
     rows = compare_closed_loops(first.trace, [closed.trace], forecasters=["hold", "kalman"])
     assert [(row.forecaster, row.replay, row.sequence) for row in rows] == [
-        ("hold", "every-frame", "race"),
-        ("kalman", "every-frame", "race"),
+        (forecaster, replay, "race")
+        for replay in ("every-frame", "modelled")
+        for forecaster in ("hold", "kalman")
     ]
     for row, summary in zip(rows, summarise_closed_loops(rows), strict=True):
         assert row.d_auc == row.auc - row.closed_auc
