@@ -286,7 +286,7 @@ def _forecast_walk(
         missed = k < resumed_at
         if k > resumed_at or (k == resumed_at and not found):
             offset = max(abs(box[0] + box[2] / 2 - x - w / 2), abs(box[1] + box[3] / 2 - y - h / 2))
-            side = max(search_side(np.array([x, y, w, h])).item(), _TINY)
+            side = max(search_side(np.array([x, y, max(w, 0.0), max(h, 0.0)])).item(), _TINY)
             missed = not offset < reach * side
             if missed:
                 same_to = min(same_to, offset / side)
