@@ -41,6 +41,11 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
         + (", or by several, one after another" if sweeps else ""),
     )
     add("--timing", metavar="TRACE", help="take the times from another device's trace")
+
+
+def add_search(parser: argparse.ArgumentParser) -> None:
+    """Add what the search model takes: how far the tracker reaches, and from where."""
+    add = parser.add_argument_group("the search model").add_argument
     add(
         "--strided",
         nargs="+",
@@ -48,13 +53,9 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
         metavar="TRACE",
         help="further passes of the tracker: on every N-th frame (lae-sim profile --stride; each "
         "sequence's boxes come from the one nearest to the frames skipped), and gap passes "
-        "(--gaps), which say how far it reaches",
+        "(--gaps), which say how far it reaches; of several traces, each pass goes with those of "
+        "its tracker and dataset",
     )
-
-
-def add_search(parser: argparse.ArgumentParser) -> None:
-    """Add what the search model takes: how far the tracker reaches, and from where."""
-    add = parser.add_argument_group("the search model").add_argument
     add(
         "--search",
         default="trace",

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim.engine.clock import Clock
-from lae_sim.evaluation.caveats import left_search
+from lae_sim.evaluation.caveats import left_search, search_notes
 from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED
@@ -367,7 +367,7 @@ def settings_text(report: Report) -> str:
     lines += [_wrapped(note) for note in report["notes"]]
     share = f"{report['approximate_outputs']:,} outputs ({100 * report['approximate_share']:.3g}%)"
     if report["search"] is not None:
-        lines += _search_text(report["search"])
+        lines += [f"  {line}" for line in search_notes(report["search"])]
     if report["exact"]:
         lines.append("  exact: every output follows the same frame as when it was recorded")
     elif report["strided"]:
@@ -381,28 +381,6 @@ def settings_text(report: Report) -> str:
             "a stateful\n  tracker would have seen larger motion there, so this is optimistic"
         )
     return "\n".join(lines)
-
-
-def _search_text(search: Report) -> list[str]:
-    """What the modelled figures rest on, in lines."""
-    interval = "an interval of 95 %" if search["c_known"] else "the ends of that range"
-    lines = [
-        "  modelled: a target is found within c search sides of where the tracker searches; "
-        f"{search['source']};",
-        f"  lost for {100 * search['lost_share']:.3g}% of the outputs; [low, high]: {interval}",
-    ]
-    if search["pre_forecaster"] is not None:
-        kept = ", the size is kept" if search["keep_size"] else ""
-        lines.append(
-            f"  pre-forecaster {search['pre_forecaster']} says where the tracker searches{kept}: "
-            "the model's figures alone"
-        )
-    if not search["c_known"]:
-        lines.append(
-            "  measure c: lae-sim profile --gaps, then --strided TRACE.gaps.parquet; or name it: "
-            "--search c=0.7"
-        )
-    return lines
 
 
 def _wrapped(note: str) -> str:
