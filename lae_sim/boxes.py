@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import isfinite
+
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.errors import LaeError
 
 PARTED_IOU = 0.5
 """Two answers for one frame that overlap less are not of the same place."""
@@ -82,3 +86,28 @@ def search_distance(searched: Floats, boxes: Floats) -> Floats:
         distance: Floats = offset / search_side(searched)
     distance[~((searched[:, 2] > 0) & (searched[:, 3] > 0))] = np.nan
     return distance
+
+
+def search_region(box: Sequence[float], image_size: tuple[int, int] | None) -> list[float]:
+    """A predicted box as a search region: centre and size ``cx, cy, w, h`` within the image.
+
+    The centre is ``x + w/2, y + h/2``, kept inside the image; a side is kept between 1 pixel and
+    the image's, since trackers crash or stall on others.
+
+    Args:
+        box: ``x, y, w, h`` in pixels.
+        image_size: width and height in pixels; None if unknown, and then nothing is too far out.
+
+    Raises:
+        LaeError: if the box is not finite.
+    """
+    x, y, w, h = (float(value) for value in box)
+    if not all(map(isfinite, (x, y, w, h))):
+        raise LaeError(f"the pre-forecaster predicted {x:g}, {y:g}, {w:g}, {h:g}, not a box")
+    centre_x, centre_y = x + w / 2, y + h / 2
+    w, h = max(w, 1.0), max(h, 1.0)
+    if image_size is not None:
+        width, height = map(float, image_size)
+        centre_x, centre_y = min(max(centre_x, 0.0), width), min(max(centre_y, 0.0), height)
+        w, h = min(w, width), min(h, height)
+    return [centre_x, centre_y, w, h]

@@ -68,8 +68,7 @@ class ComparisonResult:
     @property
     def ranking(self) -> Ranking:
         """By which scores forecasters are compared: the modelled ones, or the recorded boxes'."""
-        ranking: Ranking = self.scores.attrs["ranking"]
-        return ranking
+        return Ranking(**self.scores.attrs["ranking"])
 
     @property
     def metrics(self) -> tuple[str, ...]:

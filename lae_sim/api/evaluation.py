@@ -153,7 +153,8 @@ class Evaluated:
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
             "device": metadata.device,
-            "strided": [path_of(trace) or "an open trace" for trace in runs.passes],
+            "strided": [path_of(trace) or "an open trace" for trace in runs.strided],
+            "gap_passes": [path_of(trace) or "an open trace" for trace in runs.gap_passes],
             "search": search_report(runs.search, world.pre_forecaster, self.totals.modelled),
             "times_from": path if runs.timing is None else path_of(runs.timing) or "an open trace",
             "times_note": runs.times.metadata.timing_note,
@@ -563,7 +564,8 @@ def evaluate(
         forecasters: names, classes or factories, or a mapping from names to these; ``"hold"``, the
             baseline, is always scored.
         sigma: permitted latencies in frames, or ``"grid"`` for 0, 0.02, ..., 1.
-        latency: where processing times come from, such as ``"recorded"`` or ``"constant:47ms"``.
+        latency: where processing times come from, such as ``"recorded"``, ``"constant:47ms"`` or,
+            with the initialisation told apart, ``"constant:47ms,init=800ms"``.
         scale: exact factor on all times: ``1.5`` is 3/2, ``0.1`` is 1/10.
         fps: frames that the world shows per second, such as ``30`` or ``"30000/1001"``.
         policy: which frame a free tracker takes, such as ``"latest"`` or ``"fifo"``.

@@ -135,7 +135,7 @@ def _compare(arguments: argparse.Namespace) -> None:
     if arguments.sigma_grid:
         tables = {name: table.assign(sigma="0, 0.02, ..., 1") for name, table in tables.items()}
     if arguments.json:
-        document = {
+        document: dict[str, Any] = {
             "format": "lae-compare",
             "version": "1.0",
             "lae_sim": __version__,
@@ -150,6 +150,7 @@ def _compare(arguments: argparse.Namespace) -> None:
             "notes": result.notes,
             **{name: _records(table) for name, table in tables.items()},
         }
+        document["summary"] = [_with_modelled(row) for row in document["summary"]]
         print(json.dumps(document, indent=2, allow_nan=False))
         return
     for table in reversed(tables.values()):
@@ -183,12 +184,13 @@ def _write(table: DataFrame, path: str) -> None:
 
 
 def _records(table: DataFrame) -> list[dict[str, Any]]:
-    """The rows as JSON objects, NaN as null, what is modelled in an object of its own."""
+    """The rows as JSON objects, NaN as null."""
     rows: list[dict[str, Any]] = table.to_dict("records")
-    return [_record({k: None if v != v else v for k, v in row.items()}) for row in rows]
+    return [{k: None if v != v else v for k, v in row.items()} for row in rows]
 
 
-def _record(row: dict[str, Any]) -> dict[str, Any]:
+def _with_modelled(row: dict[str, Any]) -> dict[str, Any]:
+    """A row of the summary, with what is modelled in an object of its own."""
     modelled = {
         key.removeprefix("modelled_"): row.pop(key)
         for key in [*row]

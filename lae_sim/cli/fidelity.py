@@ -32,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
     add("trace", metavar="TRACE", help="a trace of every frame")
     several: Any = {"nargs": "+", "action": "extend", "default": [], "metavar": "TRACE"}
     add("--closed-loop", **several, required=True, help="real-time traces")
-    add("--strided", **several, help="passes on every N-th frame")
+    add("--strided", **several, help="passes on every N-th frame, and gap passes")
     add("--forecaster", nargs="+", default=["hold"], metavar="NAME", help="default: hold")
     add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
     add("--per-sequence", action="store_true", help="report each sequence")

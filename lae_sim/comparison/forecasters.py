@@ -70,7 +70,7 @@ def score_forecasters(
         trained and which replays are approximations, ``attrs["init"]`` what initialisations cost in
         each replay, ``attrs["search"]`` what the search model rests on there, and
         ``attrs["modelled"]`` its mean scores with their intervals, by forecaster and sigma;
-        ``attrs["ranking"]`` is the :class:`.modelled.Ranking`.
+        ``attrs["ranking"]`` is the :class:`.modelled.Ranking`, as plain values.
 
     Raises:
         LaeError: if there is no trace, the worlds differ in what they share, or whatever replaying,
@@ -253,6 +253,6 @@ def _joined(tables: Sequence[DataFrame], said: _Said) -> DataFrame:
         "init": said.init,
         "search": said.search,
         "modelled": said.modelled,
-        "ranking": Ranking.of(said.replays),
+        "ranking": asdict(Ranking.of(said.replays)),  # attributes are plain, to be written
     }
     return joined

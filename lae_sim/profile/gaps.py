@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -79,10 +79,10 @@ class GapPlan:
             init_s, call_s: what an initialisation and another call take, s.
         """
         own_s = sequences * (init_s + len(FOLLOWED) * call_s)
-        own = min(int(budget_s / own_s), len(OWN_GAPS)) if own_s else len(OWN_GAPS)
+        own = int(min(budget_s / own_s, len(OWN_GAPS))) if own_s else len(OWN_GAPS)
         left_s = budget_s - own * own_s
         one_s = init_s + call_s
-        sampled = min(int(left_s / one_s), SAMPLED) if one_s else SAMPLED
+        sampled = int(min(left_s / one_s, SAMPLED)) if one_s else SAMPLED
         middles = [(2 * k + 1) * len(OWN_GAPS) // (2 * own) for k in range(own)]
         return cls(tuple(OWN_GAPS[k] for k in middles), sampled)
 
@@ -224,6 +224,9 @@ class Gaps:
         self._budget_s = budget_ns / NS_PER_SECOND
         self._farthest = UNDECLARED_FARTHEST if half_side is None else BEYOND * half_side
         self._notice = notice
+        self._own = self._own_left = self._picked = 0
+        self._own_s = 0.0
+        self._sampled: dict[str, list[Start]] = {}
         self._use(GapPlan(), math.inf, 0.0)
 
     def prepare(self, journal: Journal) -> None:
@@ -254,18 +257,31 @@ class Gaps:
         When it gets short, time is kept for the own jumps of the sequences to come.
         """
         own = own_starts(sequence, self._plan.own_gaps)
-        self._own_left -= len(own)
-        reserved_s = self._own_left * self._own_s
+        began = time.monotonic()
         made: list[LiveRun | Failure] = []
-        for starts, kept_s in ((own, 0.0), (self._sampled[sequence.name], reserved_s)):
-            ahead = _ReadAhead(sequence.read, starts)
-            read = sequence.read if self._options.get("include_decode") else ahead
-            for start in starts:
-                if time.monotonic() + kept_s < self._deadline:
-                    made.append(self._made(start, sequence, read))
-                progress(len(start.frames))
-                ahead.done(start)
+        made += self._in_time(own, sequence, self._deadline, progress)
+        if own:
+            self._own_s = max(self._own_s, (time.monotonic() - began) / len(own))
+        self._own_left -= len(own)
+        deadline = self._deadline - self._own_left * self._own_s
+        made += self._in_time(self._sampled[sequence.name], sequence, deadline, progress)
         return made
+
+    def _in_time(
+        self,
+        starts: Sequence[Start],
+        sequence: ImageSequence,
+        deadline: float,
+        progress: Callable[[int], object],
+    ) -> Iterator[LiveRun | Failure]:
+        """Those that can begin before a deadline, made."""
+        ahead = _ReadAhead(sequence.read, starts)
+        read = sequence.read if self._options.get("include_decode") else ahead
+        for start in starts:
+            if time.monotonic() < deadline:
+                yield self._made(start, sequence, read)
+            progress(len(start.frames))
+            ahead.done(start)
 
     def schedule(self, names: Collection[str]) -> dict[str, Any]:
         """What the metadata says of the restarts that were made, by their names."""

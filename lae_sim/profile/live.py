@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
+from lae_sim.boxes import search_region
 from lae_sim.datasets.frames import Image, ImageSequence
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import latest, listed
@@ -209,7 +210,7 @@ class Live:
             if self._keep_size:
                 _, _, last_w, last_h = self._last_box
                 x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
-            search = search_of([x, y, w, h], self._size)
+            search = search_region([x, y, w, h], self._size)
         answer = self._tracker.track(image, search)
         if answer.box is not None:
             self._last_box = answer.box
@@ -256,27 +257,6 @@ class Live:
             frames[[answer.box is None for answer in self._answers]],
             self._size,
         )
-
-
-def search_of(box: Sequence[float], size: tuple[int, int]) -> list[float]:
-    """A predicted box as a search region: centre and size ``cx, cy, w, h`` within the image.
-
-    The centre is ``x + w/2, y + h/2``, kept inside the image; a side is kept between 1 pixel and
-    the image's, since trackers crash or stall on others.
-
-    Raises:
-        LaeError: if the box is not finite.
-    """
-    x, y, w, h = (float(value) for value in box)
-    if not np.isfinite((x, y, w, h)).all():
-        raise LaeError(f"the pre-forecaster predicted {_text([x, y, w, h])}, not a box")
-    width, height = size
-    return [
-        min(max(x + w / 2, 0.0), float(width)),
-        min(max(y + h / 2, 0.0), float(height)),
-        min(max(w, 1.0), float(width)),
-        min(max(h, 1.0), float(height)),
-    ]
 
 
 def _text(box: Sequence[float] | Floats) -> str:

@@ -145,15 +145,15 @@ class _Job:
         passes = {self.stride: self.recording, **self.passes}
         strides = sorted(passes)
         nearest = _nearest(strides, frames)
-        source = passes[strides[nearest]]
-        boxes = _boxes(source, frames)
-        before = self.before if source is self.recording else _before(source, strides[nearest])
+        stride = strides[nearest]
+        boxes = _boxes(passes[stride], frames)
+        before = self.before if stride == self.stride else _before(passes[stride], stride)
         departures = _departures(before, frames)
         disagreement = np.nan
         if self.passes:
             parted = np.zeros(len(frames), bool)
-            for stride in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
-                parted |= iou(_boxes(passes[stride], frames), boxes) < PARTED_IOU
+            for other in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
+                parted |= iou(_boxes(passes[other], frames), boxes) < PARTED_IOU
             disagreement = float(parted.mean())
         run = Run(self.recording, schedule, boxes, departures, disagreement)
         if self.search is None or not (departures or self.search.pre_forecaster is not None):
@@ -161,8 +161,8 @@ class _Job:
         farther = np.append(False, np.diff(frames) > (frames - before.take(frames))[1:])
         recorded = [RecordedAnswers(boxes, farther)]
         if self.passes:
-            for stride in _beside(strides, frames):
-                recorded += phase_answers(stride, passes[stride], frames)
+            for other in _beside(strides, frames):
+                recorded += phase_answers(other, passes[other], frames)
         modelled = self.search.outcomes(self.recording, frames, recorded, self.image_size)
         return replace(run, modelled=modelled)
 
@@ -268,6 +268,11 @@ class Runs:
     def strided(self) -> tuple[Trace, ...]:
         """The passes at other strides."""
         return split_passes(self.passes)[0]
+
+    @property
+    def gap_passes(self) -> tuple[Trace, ...]:
+        """The passes that measure how far the tracker reaches."""
+        return split_passes(self.passes)[1]
 
     @property
     def times(self) -> Trace:

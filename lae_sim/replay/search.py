@@ -26,7 +26,7 @@ from math import ceil, inf, log
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.boxes import iou, search_distance, search_side
+from lae_sim.boxes import iou, search_distance, search_region, search_side
 from lae_sim.errors import LaeError
 from lae_sim.forecast.base import AnyFactory, Forecaster, ImageSize, factory_for
 from lae_sim.replay.reach import (
@@ -187,7 +187,9 @@ class SearchModel:
 
         def walk(reach: float) -> tuple[Floats, Bools, float]:
             forecaster = factory(answers.boxes[0].tolist(), image_size)
-            return _forecast_walk(frames, answers, resumed, reach, forecaster, self.keep_size)
+            return _forecast_walk(
+                frames, answers, resumed, reach, forecaster, self.keep_size, image_size
+            )
 
         return walk
 
@@ -272,6 +274,7 @@ def _forecast_walk(
     reach: float,
     forecaster: Forecaster,
     keep_size: bool,
+    image_size: ImageSize,
 ) -> tuple[Floats, Bools, float]:
     """The run of a tracker that searches where a pre-forecaster says; every call is tested."""
     rows = answers.boxes.tolist()
@@ -279,18 +282,19 @@ def _forecast_walk(
     same_to = inf
     resumed_at, found = resumed
     for k, (frame, box) in enumerate(zip(frames[1:].tolist(), rows[1:]), 1):
-        x, y, w, h = map(float, forecaster.predict(frame))
+        x, y, w, h = forecaster.predict(frame)
         if keep_size:
             *_, last_w, last_h = answered[-1]
             x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
+        centre_x, centre_y, w, h = search_region([x, y, w, h], image_size)
         missed = k < resumed_at
         if k > resumed_at or (k == resumed_at and not found):
-            offset = max(abs(box[0] + box[2] / 2 - x - w / 2), abs(box[1] + box[3] / 2 - y - h / 2))
-            side = max(search_side(np.array([x, y, max(w, 0.0), max(h, 0.0)])).item(), _TINY)
+            offset = max(abs(box[0] + box[2] / 2 - centre_x), abs(box[1] + box[3] / 2 - centre_y))
+            side = search_side(np.array([0.0, 0.0, w, h])).item()
             missed = not offset < reach * side
             if missed:
                 same_to = min(same_to, offset / side)
-        answered.append([x, y, w, h] if missed else box)
+        answered.append([centre_x - w / 2, centre_y - h / 2, w, h] if missed else box)
         lost.append(missed)
         forecaster.update(frame, answered[-1])
     return np.array(answered), np.array(lost), same_to * (1 - 1e-12)

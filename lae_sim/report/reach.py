@@ -274,7 +274,8 @@ def _draw_curve(axes: Axes, report: ReachReport) -> None:
     axes.set(xlabel="distance, max(|dx|, |dy|) / search side", ylabel="share of targets found")
     axes.set(xlim=(0, farthest), ylim=(-0.03, 1.03))
     axes.set_title(printable(report.tracker))
-    axes.legend(loc="lower left" if _is_free(bins) else "upper right", fontsize=8)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="lower left" if _is_free(bins) else "upper right", fontsize=8)
 
 
 def _is_free(bins: Sequence[Bin]) -> bool:

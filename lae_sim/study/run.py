@@ -25,6 +25,7 @@ from lae_sim.study.spec import Study
 from lae_sim.study.store import Store
 from lae_sim.study.summary import Scores, compare_traces, read_scores, summarise_study
 from lae_sim.study.work import Description, Work, attempt
+from lae_sim.trace.describe import is_measured
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -54,7 +55,7 @@ class StudyResults:
         ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
         ...     )
         ...     results.to_frame().shape
-        (16, 29)
+        (16, 30)
         >>> results
         <StudyResults of 2 settings, 2 cells in ...>
         >>> results.summary_frame()[["forecaster", "auc", "vs_hold_auc"]].round(3)
@@ -102,14 +103,18 @@ class StudyResults:
         html: str = table[shown].to_html(index=False, float_format="{:.4f}".format, na_rep="-")
         return html
 
-    def init_sources(self) -> list[str]:
-        """How one knows what initialisations cost, for each latency."""
+    def init_sources(self, assumed: bool = False) -> list[str]:
+        """How one knows what initialisations cost, and at which latencies.
+
+        Args:
+            assumed: whether those are left out that were measured.
+        """
         latencies: dict[str, dict[str, None]] = {}
         for row in self.summary:
-            latencies.setdefault(row.init_source, {})[row.latency] = None
-        return [
-            f"initialisation at {', '.join(some)}: {source}" for source, some in latencies.items()
-        ]
+            if not (assumed and is_measured(row.init_source)):
+                unscaled = row.init_source.removesuffix(f" x {row.scale}")
+                latencies.setdefault(unscaled, {})[row.latency] = None
+        return [f"initialisation at {', '.join(some)}: {how}" for how, some in latencies.items()]
 
     def notes(self) -> list[str]:
         """What keeps the figures from being what their names promise, each once."""
@@ -124,7 +129,7 @@ class StudyResults:
         for source in self.plan.sources:
             if source.metadata.timing_note:
                 notes.append(f"{source.input.label}: times: {source.metadata.timing_note}")
-        notes += [*self.init_sources(), *self.training]
+        notes += [*self.init_sources(assumed=True), *self.training]
         notes += [
             note for scores in self.scores for about in scores.about for note in about["notes"]
         ]

@@ -54,7 +54,7 @@ class InitCost:
     @property
     def is_measured(self) -> bool:
         """Whether the times, before they were scaled, were measured somewhere."""
-        return self.source.removeprefix(TRACES_TIMES).startswith("measured")
+        return is_measured(self.source)
 
     def __str__(self) -> str:
         """A sentence."""
@@ -69,6 +69,11 @@ class InitCost:
         if self.source.startswith(TRACES_TIMES) and not self.is_measured:
             return f"{cost}: an assumption ({self.source})"
         return f"{cost}, {self.source}"
+
+
+def is_measured(source: str) -> bool:
+    """Whether a source of an :class:`InitCost` is a measurement."""
+    return source.removeprefix(TRACES_TIMES).startswith("measured")
 
 
 def in_ms(ms: float) -> str:

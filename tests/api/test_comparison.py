@@ -25,7 +25,9 @@ SLOW, FAST = TRACES / "synthetic-slow.parquet", TRACES / "synthetic-fast.parquet
 
 @pytest.fixture(scope="module")
 def result() -> lae_sim.ComparisonResult:
-    return lae_sim.compare_forecasters([SLOW, FAST], forecasters=["kalman", "least-squares"])
+    return lae_sim.compare_forecasters(
+        [SLOW, FAST], forecasters=["kalman", "least-squares"], search="off"
+    )
 
 
 def test_scores_are_those_of_evaluating(result: lae_sim.ComparisonResult) -> None:
@@ -47,7 +49,8 @@ def test_the_summary_is_that_of_the_room_below(result: lae_sim.ComparisonResult)
     forecasters = {
         name: lae_sim.load_forecaster(name) for name in ("hold", "kalman", "least-squares")
     }
-    expected = summarise(score_forecasters(traces, forecasters), metrics=("auc", "dp20"), seed=0)
+    scores = score_forecasters(traces, forecasters, [lae_sim.World.of(search="off")])
+    expected = summarise(scores, metrics=("auc", "dp20"), seed=0)
     pd.testing.assert_frame_equal(result.summary, expected)
     means = result.to_frame().groupby(["trace", "forecaster", "metric"])["value"].mean()
     for row in result.summary.itertuples():
@@ -75,6 +78,12 @@ def test_the_command_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
         rows = json.loads(table.to_json(orient="records", double_precision=15))
         assert len(rows) == len(document[key])
         for row, printed in zip(rows, document[key], strict=True):
+            modelled = printed.pop("modelled", None) or {}
+            assert set(modelled) >= {"c_known", "auc", "auc_low", "auc_high"} or not modelled
+            for name, value in modelled.items():
+                own = name in ("c_known", "lost_share")
+                assert row.pop(name if own else f"modelled_{name}") == pytest.approx(value)
+            row = {name: value for name, value in row.items() if name in printed}
             assert row == pytest.approx(printed, abs=1e-9)
     assert document["notes"] == result.notes
 
@@ -93,7 +102,7 @@ def test_what_must_be_trained_is_trained_on_other_sequences() -> None:
 
 
 def test_the_grid_is_compared_as_means() -> None:
-    result = lae_sim.compare_forecasters(SLOW, forecasters="kalman", sigma="grid")
+    result = lae_sim.compare_forecasters(SLOW, forecasters="kalman", sigma="grid", search="off")
     assert result.metrics == ("mauc", "mdp20")
     assert set(result.summary["metric"]) == {"mauc", "mdp20"}
     pd.testing.assert_frame_equal(

@@ -147,8 +147,7 @@ def test_json_says_the_same(here: Path) -> None:
         "mine-Bright-data.closed-loop-0.5ms.parquet",
         "mine-Bright-data.closed-loop-0.5ms-init-1000ms.parquet",
     ]
-    slow = read_trace(report["traces"][-1]["trace"])["a"]
-    assert np.flatnonzero(slow.elapsed_ns >= 0).tolist()[:1] == [0]
+    slow = read_trace(here / report["traces"][-1]["trace"])["a"]
     assert slow.elapsed_ns[0] == 1_000_000_000
     assert report["traces"][-1]["timing"].startswith("constant 0.5ms, initialisation 1000 ms")
     assert report["traces"][0]["world_frames"] == report["traces"][0]["processed"] == 20
@@ -402,3 +401,65 @@ def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
     _, err = process.communicate(timeout=120)
     assert process.returncode == 2
     assert "no closed loop" in err
+
+
+def ran(here: Path, *arguments: str, status: int = 0) -> tuple[str, str]:
+    module, *rest = arguments
+    process = start(here, *rest, module=module)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == status, (out, err)
+    assert "Traceback" not in err
+    return out, err
+
+
+def test_a_gap_pass_goes_beside_the_other_passes(here: Path) -> None:
+    make_dataset(here / "fast", {"a": 40, "c": 40}, step=3)
+    mine = ("--tracker", "mine:Bright", "--root", "fast", "--option", "reach=8")
+    passes = ("--stride", "2", "--gaps", "--closed-loop", "constant:47ms")
+    out, _ = profile(here, *mine, *passes, "--out", "t.parquet")
+    strided = "--strided t.stride2.parquet t.gaps.parquet"
+    replay = f"lae-sim replay t.parquet {strided}"
+    fidelity = f"lae-sim fidelity t.parquet {strided} --closed-loop t.closed-loop-47ms.parquet"
+    assert f"{replay}\n" in out
+    assert f"{fidelity}\n" in out
+    assert "lae-sim show t.gaps.parquet --plot reach.png" in out
+    validate(here / "t.gaps.parquet")
+
+    slow = ("--latency", "constant:47ms", "--json")
+    with_gaps, _ = ran(here, *replay.split()[1:], *slow)
+    without, _ = ran(here, *replay.split()[1:-1], *slow)
+    both = [json.loads(text)["traces"][0]["results"] for text in (with_gaps, without)]
+    assert [row["auc"] for row in both[0]] == [row["auc"] for row in both[1]]
+    ran(here, *replay.split()[1:], "--sequence", "a")
+    ran(here, "replay", "t.parquet", "--strided", "t.gaps.parquet", *slow)
+    rows, _ = ran(here, *fidelity.split()[1:], "--json")
+    assert {row["replay"] for row in json.loads(rows)["summary"]} >= {"every-frame", "strided"}
+
+    for command in ("replay", "compare"):
+        _, err = ran(here, command, "t.gaps.parquet", status=2)
+        assert err.count("\n") == 1
+        assert "is a gap pass" in err
+        assert "--strided" in err
+
+    said, _ = ran(here, "show", "t.gaps.parquet")
+    assert "reach        centre" in said
+    # it looks 8 pixels around, and 3 a frame are 9 at the third
+    assert "found up to gap" not in said
+    assert "lost from gap 3 on" in said
+    shown, _ = ran(here, "show", "t.gaps.parquet", "t.parquet", "--json")
+    gaps, every = json.loads(shown)["traces"]
+    side = 22.0  # of 12 x 10 pixels
+    assert gaps["reach"]["centre"] == pytest.approx(8 / side, abs=0.1)
+    assert "reach" not in every
+    ran(here, "show", "t.gaps.parquet", "--plot", "reach.png")
+    assert (here / "reach.png").stat().st_size > 10_000
+    _, err = ran(here, "show", "t.gaps.parquet", "t.parquet", "--plot", "x.png", status=2)
+    assert "one by one" in err
+
+
+def test_a_tracker_that_declares_no_search_region(here: Path) -> None:
+    text = TRACKERS.replace('"version": "1",', '"version": "1", "search": {"half_side": "big"},')
+    (here / "mine.py").write_text(text)
+    _, err = profile(here, *MINE, status=2)
+    assert "tracker.search.half_side" in err
+    assert "such as 1.0" in err

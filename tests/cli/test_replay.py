@@ -488,7 +488,7 @@ def test_measured_initialisations_are_called_so(tmp_path):
     assert replay_json(tmp_path / "m.parquet")["traces"][0]["init"]["source"] == "measured"
     timed = replay_json(SLOW, "--timing", tmp_path / "m.parquet")["traces"][0]
     assert timed["init"]["source"] == "measured"
-    assert "ms), measured\n" in replay(tmp_path / "m.parquet")
+    assert "initialisation costs 282 ms, measured\n" in replay(tmp_path / "m.parquet")
     noted = {"timing": {"source": "measured", "note": "initialisations are unknown"}}
     written(tmp_path / "n.parquet", list(trace), **noted)
     assert "the trace's times: measured; initialisations" in replay(tmp_path / "n.parquet")
@@ -504,7 +504,7 @@ def test_a_slow_initialisation_costs_accuracy_and_names_who_gets_away():
     assert "car-occluded" in names
     assert slow["results"][0]["auc"] < fast["results"][0]["auc"] - 0.02
     text = " ".join(replay(SLOW, "--latency", "constant:20ms,init=2s").split())
-    assert f"around the initial box: {', '.join(names)} approximate" in text
+    assert f"around the initial box: {', '.join(names)} modelled: " in text
 
 
 def test_attributes_that_the_trace_does_not_name(tmp_path):
@@ -572,5 +572,6 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     assert calls == alone
     assert {path.name for path in tmp_path.iterdir()} == set(files.values())
     calls.clear()
-    assert replay_command.main([str(SLOW), "--timeline", str(tmp_path / "timeline.svg")]) == 0
+    timeline = ["--timeline", str(tmp_path / "timeline.svg"), "--search", "off"]
+    assert replay_command.main([str(SLOW), *timeline]) == 0
     assert calls == {"simulate": 8, "pair": 1, "forecast": 2}

@@ -174,7 +174,7 @@ def test_little_is_said_where_little_is_known(run: Callable[..., str], tmp_path:
     assert not {"unknown", "None", "null", "readings", "device", "warning", "stalls"} & set(
         text.split()
     )
-    assert len(text.splitlines()) < 20
+    assert len(text.splitlines()) <= 20
     assert "100% of the calls" in text
 
 
@@ -189,8 +189,7 @@ def test_samples_are_shown_one_after_the_other(run: Callable[..., str]) -> None:
     text = run(SLOW, REAL_TIME)
     assert "warning      the first call after an initialisation takes 102 ms, 2.2 x" in text
     assert "timing       synthetic (made up, not measured)" in text
-    assert "\ninitialisation costs 300 ms, measured\n" in text
-    assert "): an assumption (the trace's times: synthetic (made up, not measured))" in text
+    assert "costs 282 ms: an assumption (the trace's times: synthetic (made up" in text
     assert "1,677 processed" in text
     assert text.count("times, ms") == 2
     assert "(sequences by name: their order is unknown)" in text
@@ -214,6 +213,7 @@ def test_json_has_the_same(run: Callable[..., str], full: Path) -> None:
     assert times["drift"]["slower"] is True
     assert times["stalls"][0] == {"sequence": "s04", "frame": 77, "ms": 812.0, "first_call": False}
     assert len(first["warnings"]) == 3
+    assert "\ninitialisation costs 300 ms, measured\n" in run(full)
     assert (second["lost"], second["times"]["order_known"]) == (None, False)
 
 

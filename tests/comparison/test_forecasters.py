@@ -54,7 +54,7 @@ def values(table: pd.DataFrame, **wanted: Any) -> np.ndarray:
 
 
 def test_columns_and_rows(slow: Trace) -> None:
-    table = score_forecasters({"slow": slow}, FORECASTERS)
+    table = score_forecasters({"slow": slow}, FORECASTERS, [World.of(search="off")])
     assert list(table) == [*KEYS, "value"]
     assert not table.duplicated(KEYS).any()
     assert len(table) == 4 * 4 * 3  # metrics, forecasters with hold and offline, sequences
@@ -71,7 +71,13 @@ def test_every_value_is_what_evaluate_gives(slow: Trace, fast: Trace) -> None:
     scales, sigmas = [Fraction(1, 2), Fraction(2)], [Fraction(0), Fraction(1, 3), Fraction(1)]
     fps, convention = Fraction(25), find_convention("otb")
     worlds = World.sweep(
-        fps=fps, policy=fifo, latency=list(sources), scale=scales, sigma=sigmas, convention="otb"
+        fps=fps,
+        policy=fifo,
+        latency=list(sources),
+        scale=scales,
+        sigma=sigmas,
+        convention="otb",
+        search="off",
     )
     traces = {"slow": slow, "fast": fast}
     table = score_forecasters(traces, FORECASTERS, worlds)
@@ -141,9 +147,12 @@ def test_nothing_is_trained_on_what_it_is_scored_on(slow: Trace, fast: Trace) ->
 def test_notes_say_what_is_approximate(slow: Trace) -> None:
     worlds = World.sweep(latency=["constant:1ms", "constant:90ms"])
     notes = score_forecasters({"slow": slow}, {}, worlds).attrs["notes"]
+    assumed = "ms, the same as a frame: an assumption; name it with ,init=TIME"
     assert notes == [
+        f"slow, constant:1ms: initialisation costs 1 {assumed}",
+        f"slow, constant:90ms: initialisation costs 90 {assumed}",
         "slow, constant:90ms: approximate, 100% of the outputs follow another frame than when "
-        "recorded"
+        "recorded",
     ]
 
 

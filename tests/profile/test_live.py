@@ -15,6 +15,7 @@ from fakes import FakeTimed, bright_frame, bright_sequence
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lae_sim.boxes import search_region
 from lae_sim.datasets.frames import ImageSequence
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import every, fifo, latest, listed, shrinking_tail, vot_realtime
@@ -24,7 +25,7 @@ from lae_sim.forecast.base import ConstantVelocity, Oracle
 from lae_sim.forecast.filters import GH
 from lae_sim.forecast.kalman import Kalman
 from lae_sim.forecast.window import LeastSquares, Windowed
-from lae_sim.profile.live import LiveRun, run_every_frame, run_real_time, search_of
+from lae_sim.profile.live import LiveRun, run_every_frame, run_real_time
 from lae_sim.profile.timed import Answer, TrackerError
 from lae_sim.replay.latency import constant
 from lae_sim.replay.run import Run, replay_sequence
@@ -139,7 +140,7 @@ def test_the_pre_forecaster_sets_the_search_before_each_frame() -> None:
     filtered = Kalman(PATH[0] + (12, 10))
     for frame, search in zip(run.frames[1:].tolist(), tracker.searches):
         predicted = filtered.predict(frame)
-        assert search == pytest.approx(search_of(predicted, (96, 64)), abs=1e-12)
+        assert search == pytest.approx(search_region(predicted, (96, 64)), abs=1e-12)
         if frame not in run.lost:
             filtered.update(frame, run.recording.boxes[frame].tolist())
 
@@ -347,15 +348,15 @@ def test_any_forecaster_may_be_the_pre_forecaster_and_is_new_in_each_pass(factor
     np.testing.assert_array_equal(again.recording.boxes, closed.recording.boxes)
     if factory is Oracle:
         truth = bright_sequence(PATH).truth[1:]
-        searches = [search_of(box, (96, 64)) for box in truth]
+        searches = [search_region(box, (96, 64)) for box in truth]
         np.testing.assert_array_equal(tracker.searches, searches * 2)
 
 
 def test_a_search_stays_within_the_image() -> None:
-    assert search_of([10, 20, 4, 6], (96, 64)) == [12, 23, 4, 6]
-    assert search_of([-50, 100, -3, 5000], (96, 64)) == [0, 64, 1, 64]
+    assert search_region([10, 20, 4, 6], (96, 64)) == [12, 23, 4, 6]
+    assert search_region([-50, 100, -3, 5000], (96, 64)) == [0, 64, 1, 64]
     with pytest.raises(LaeError, match="pre-forecaster"):
-        search_of([np.nan, 0, 1, 1], (96, 64))
+        search_region([np.nan, 0, 1, 1], (96, 64))
 
 
 @given(stride=st.sampled_from([2, 3]), at=st.integers(1, 3))

@@ -137,11 +137,11 @@ def test_times_of_another_device(tmp_path: Path) -> None:
 def test_times_of_another_device_may_tell_the_initialisation_apart(tmp_path: Path) -> None:
     box = [[1.0, 1, 9, 9]] * 6
     path = tmp_path / "a,b.parquet"
-    recordings = [Recording.new("a", box, box, [7, 8, 9, 10, 11, 12])]
+    recordings = [Recording.new("a", box, box, np.arange(7, 13) * 10**6)]
     write_trace(Trace(Metadata.new("30", "every-frame"), recordings), path)
     source, timing = parse_timing(f"{path},init=1s")
     assert source == "a,b.parquet (unknown), initialisation 1000 ms, not measured here"
-    assert [timing(sequence("a"))(frame) for frame in range(3)] == [10**9, 8, 9]
+    assert [timing(sequence("a"))(frame) for frame in range(3)] == [10**9, 8_000_000, 9_000_000]
     source, timing = parse_timing("constant:47ms,init=800ms")
     assert source == "constant 47ms, initialisation 800 ms, not measured"
     assert [timing(sequence("b"))(frame) for frame in range(2)] == [800_000_000, 47_000_000]

@@ -85,7 +85,7 @@ def test_the_page_is_whole_and_has_every_section(checked):
     assert len(ids) == len(set(ids))
     assert {*ids} == {
         "failures", "ranking", "table2", "curves", "sweeps", "front", "gains", "attributes",
-        "comparisons", "required", "times", "traces", "conventions", "study",
+        "comparisons", "required", "times", "traces", "conventions", "notes", "study",
     }  # fmt: skip
     assert [a["href"] for a in checked.of("a")] == [f"#{name}" for name in ids]
     assert all(th.get("scope") for th in checked.of("th"))
@@ -138,8 +138,11 @@ def test_a_study_of_one_trace_and_hold_alone_is_the_same_bytes_twice(tmp_path):
     text = page(View(results))
     ids = [attrs["id"] for _, attrs in Checker(text).found if "id" in attrs]
     assert ids == [
-        "ranking", "table2", "curves", "front", "times", "traces", "conventions", "study"
+        "ranking", "table2", "curves", "front", "times", "traces", "conventions", "notes", "study"
     ]  # fmt: skip
+    assert results.notes() == [
+        "initialisation at recorded: the trace's times: whether measured, it does not say"
+    ]
     assert "every replay is exact" not in text
     write_report(results, tmp_path / "report.html")
     assert (tmp_path / "report.html").read_text("utf-8") == text

@@ -10,7 +10,7 @@ import pytest
 from witness import MINIMAL
 
 from lae_sim.errors import TraceError
-from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.metadata import KINDS, Metadata, Search
 
 
 def parse(**changes: Any) -> Metadata:
@@ -170,3 +170,40 @@ def test_whatever_is_read_can_be_written() -> None:
         except TraceError:
             continue
         assert Metadata.parse(metadata.dumps()) == metadata
+
+
+def test_a_search_region_is_read() -> None:
+    assert parse().search is None
+    assert parse(tracker={"search": None}).search is None
+    assert parse(tracker={"search": {"half_side": 2}}).search == Search(2.0, None, None)
+    declared = {"half_side": 1.25, "window": True, "source": "its paper"}
+    assert parse(tracker={"search": declared}).search == Search(1.25, True, "its paper")
+
+
+@pytest.mark.parametrize(
+    ("search", "key"),
+    [
+        ("near", "search'"),
+        ([1.0], "search'"),
+        ({}, "half_side"),
+        ({"half_side": 0}, "half_side"),
+        ({"half_side": -1.0}, "half_side"),
+        ({"half_side": "1.0"}, "half_side"),
+        ({"half_side": True}, "half_side"),
+        ({"half_side": 10**400}, "half_side"),
+        ({"half_side": 1.0, "window": "yes"}, "window"),
+        ({"half_side": 1.0, "source": 127}, "source"),
+    ],
+)
+def test_a_search_region_that_is_none_is_refused(search: Any, key: str) -> None:
+    with pytest.raises(TraceError, match=f"tracker.search.*{key}|tracker.{key}"):
+        parse(tracker={"search": search})
+
+
+def test_only_restarts_need_a_newer_reader() -> None:
+    versions = [Metadata.new(30, kind).document["version"] for kind in KINDS]
+    assert dict(zip(KINDS, versions, strict=True)) == {
+        "every-frame": "1.0",
+        "real-time": "1.0",
+        "restarts": "1.1",
+    }

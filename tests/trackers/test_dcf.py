@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from moving import HEIGHT, WIDTH, centre_error, moving, straight
 
-from lae_sim.boxes import iou
+from lae_sim.boxes import iou, search_side
 from lae_sim.datasets.frames import read_image
 from lae_sim.errors import LaeError
 from lae_sim.trackers.names import make_tracker
@@ -179,6 +179,16 @@ def test_describes_itself():
     told = dcf(padding=3.5).describe()
     assert told["name"] == "dcf"
     assert told["settings"]["padding"] == 3.5
+    assert dcf().describe()["search"]["half_side"] == 1
+
+
+def test_it_finds_nothing_beyond_the_search_region_that_it_declares():
+    side = float(search_side(np.array([0.0, 0, 40, 40])))
+    for share, hit in ((0.2, True), (1.1, False)):
+        moved = [[100, 60, 40, 40], [100 + share * side, 60, 40, 40]]
+        (found,) = boxes_of(dcf(), list(moving(moved)), moved[0])
+        overlap = iou(np.array([found]), np.array(moved[1:]))[0]
+        assert (overlap > 0.3) == hit
 
 
 @pytest.mark.parametrize(

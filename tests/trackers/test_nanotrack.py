@@ -98,6 +98,8 @@ def test_describes_itself(weights):
         == hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     )
     assert 0 < told["settings"]["lr"] < 1
+    assert told["search"]["half_side"] == 1
+    assert told["search"]["window"] is True
 
 
 def test_refuses_before_init_and_places_that_are_none(weights):

@@ -58,6 +58,8 @@ def test_nano_has_a_score(shared_data):
     assert len(told["weights_digest"]) == 64
     assert told["settings"]["network_loaded_in_init"] in (False, True)
     assert told["version"] == cv2.__version__
+    assert told["search"]["half_side"] == 1
+    assert "search" not in make_tracker("opencv:mil", {}).describe()  # a number of pixels
 
 
 @pytest.mark.parametrize(

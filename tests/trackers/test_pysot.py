@@ -6,6 +6,7 @@ import importlib
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -195,6 +196,21 @@ def test_describe(checkout: Path) -> None:
     assert found["settings"]["tracker"] == "SiamRPNTracker"
     assert found["settings"]["device"] == "cpu"
     assert len(found["weights_digest"]) == 64
+    assert "search" not in found  # this configuration does not say
+
+
+def test_the_search_region_is_the_configurations(checkout: Path) -> None:
+    tracker = PySot(**options(checkout))
+    config: Any = importlib.import_module("pysot.core.config").cfg
+    track = {"EXEMPLAR_SIZE": 127, "INSTANCE_SIZE": 287, "WINDOW_INFLUENCE": 0.0}
+    config.TRACK = SimpleNamespace(**track)
+    assert tracker.describe()["search"] == {
+        "half_side": 287 / 127 / 2,
+        "window": False,
+        "source": "crops of 127 and 287 pixels (config.yaml)",
+    }
+    config.TRACK = SimpleNamespace(**track, CONTEXT_AMOUNT=0.3)
+    assert "search" not in tracker.describe()
 
 
 def test_a_fork_with_several_trackers(checkout: Path) -> None:

@@ -163,6 +163,15 @@ def test_describe(checkout: Path) -> None:
     assert found["settings"]["network"] == "smallnet"
     assert found["settings"]["device"] == "cpu"
     assert len(found["weights_digest"]) == 64
+    assert "search" not in found
+
+
+def test_the_search_region_is_the_parameters(checkout: Path) -> None:
+    file = checkout / "pytracking" / "parameter" / "small" / "plain.py"
+    text = file.read_text()
+    file.write_text(text.replace("return params", "params.search_area_scale = 5; return params"))
+    search = PyTracking(**options(checkout)).describe()["search"]
+    assert (search["half_side"], search["window"]) == (1.25, False)
 
 
 def test_checkpoints_are_read_only_where_trusted(checkout: Path) -> None:
