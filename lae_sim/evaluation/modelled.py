@@ -154,11 +154,11 @@ def interval(draws: Floats, known: bool, unexplained: float, applies: int) -> tu
 
 
 def over_sigmas(draws: Floats) -> Floats:
-    """Joint draws of the plain means over the permitted latencies, float64 [2, F, J, 1]."""
+    """Joint draws of the plain means over the permitted latencies, float64 [..., 1]."""
     sums, counts = draws
     means = (sums / np.where(counts > 0, counts, np.nan)).mean(axis=-1, keepdims=True)
-    most = counts.max(axis=-1, keepdims=True)
-    return np.stack([means * most, most])
+    known, most = ~np.isnan(means), counts.max(axis=-1, keepdims=True)
+    return np.stack([np.where(known, means * most, 0.0), np.where(known, most, 0.0)])
 
 
 @dataclass(frozen=True)

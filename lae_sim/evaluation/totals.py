@@ -145,13 +145,14 @@ class ModelledTotals:
     Attributes:
         known: see :class:`.modelled.ModelledScores`.
         applies: number of sequences whose replay is not exact.
+        unexplained: see :class:`.modelled.ModelledScores`.
     """
 
     def __init__(self, hold: int) -> None:
         """With the index of the forecaster that others are to do better than."""
         self.known: bool | None = None
         self.applies = 0
-        self._unexplained: Mapping[str, float] = {}
+        self.unexplained: Mapping[str, float] = {}
         self._hold = hold
         self._draws: dict[str, list[Floats]] = {metric: [] for metric in MODELLED}
         self._scores = {metric: Mean() for metric in MODELLED}
@@ -163,7 +164,7 @@ class ModelledTotals:
         """Add the sequences of a part."""
         modelled, outputs = part.modelled, part.replay.processed
         if self.known is None:
-            self.known, self._unexplained = modelled.known, modelled.unexplained
+            self.known, self.unexplained = modelled.known, modelled.unexplained
         self.applies += int(modelled.applies.sum())
         self._outputs += float(outputs.sum())
         self._lost_outputs += float(modelled.lost_share @ outputs)
@@ -183,6 +184,11 @@ class ModelledTotals:
         """Share of the outputs answered while the target is lost, 0..1."""
         return self._lost_outputs / self._outputs if self._outputs else 0.0
 
+    def draws(self, metric: str) -> Floats:
+        """Joint draws over all sequences, float64 [2, F, J, M] (see :class:`.ModelledScores`)."""
+        (draws,) = self._draws[metric]
+        return draws
+
     def figures(self, over_grid: bool = False) -> dict[str, Floats]:
         """Mean scores, and the ends of their intervals: auc, auc_low, auc_high, dp20, ...
 
@@ -194,11 +200,11 @@ class ModelledTotals:
         """
         figures: dict[str, Floats] = {}
         for metric in MODELLED:
-            (draws,) = self._draws[metric]
+            draws = self.draws(metric)
             mean = self._scores[metric].value
             if over_grid:
                 draws, mean = over_sigmas(draws), mean.mean(axis=1, keepdims=True)
-            ends = interval(draws, bool(self.known), self._unexplained[metric], self.applies)
+            ends = interval(draws, bool(self.known), self.unexplained[metric], self.applies)
             figures |= dict(zip((metric, f"{metric}_low", f"{metric}_high"), (mean, *ends)))
         return figures
 
