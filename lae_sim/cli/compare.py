@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli.options import (
     add_forecasting,
+    add_passes,
     add_search,
     add_worlds,
     argument,
@@ -59,6 +60,7 @@ def parser() -> argparse.ArgumentParser:
         help="see below (default: kalman least-squares tuned-kalman); hold is always compared",
     )
     add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
+    add_passes(add)
     add_forecasting(made)
     add_worlds(made, [Fraction(1)])
     add_search(made)

@@ -42,10 +42,11 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
     )
     add("--timing", metavar="TRACE", help="take the times from another device's trace")
 
+    add_passes(add)
 
-def add_search(parser: argparse.ArgumentParser) -> None:
-    """Add what the search model takes: how far the tracker reaches, and from where."""
-    add = parser.add_argument_group("the search model").add_argument
+
+def add_passes(add: Callable[..., argparse.Action]) -> None:
+    """Add further passes of the tracker, by what adds to a parser or a group."""
     add(
         "--strided",
         nargs="+",
@@ -53,9 +54,18 @@ def add_search(parser: argparse.ArgumentParser) -> None:
         metavar="TRACE",
         help="further passes of the tracker: on every N-th frame (lae-sim profile --stride; each "
         "sequence's boxes come from the one nearest to the frames skipped), and gap passes "
-        "(--gaps), which say how far it reaches; of several traces, each pass goes with those of "
-        "its tracker and dataset",
+        "(--gaps), which say how far it reaches",
     )
+
+
+def add_search(parser: argparse.ArgumentParser, pre_forecaster: bool = True) -> None:
+    """Add what the search model takes: how far the tracker reaches, and from where.
+
+    Args:
+        parser: the command line.
+        pre_forecaster: whether it may say where the tracker searches.
+    """
+    add = parser.add_argument_group("the search model").add_argument
     add(
         "--search",
         default="trace",
@@ -63,6 +73,8 @@ def add_search(parser: argparse.ArgumentParser) -> None:
         help="how far the tracker finds its target: c=0.7 search sides, a range c=0.6-1.0, what "
         "the traces know (trace, the default), or no search model (off)",
     )
+    if not pre_forecaster:
+        return
     add(
         "--pre-forecaster",
         metavar="NAME",

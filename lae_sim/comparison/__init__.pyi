@@ -1,4 +1,12 @@
-from .fidelity import FidelityRow, FidelitySummary, compare_closed_loops, summarise_closed_loops
+from .fidelity import (
+    ClosedLoopSpread,
+    FidelityRow,
+    FidelitySummary,
+    closed_loop_spreads,
+    compare_closed_loops,
+    summarise_closed_loops,
+    summarise_replays,
+)
 from .forecasters import fitted, score_forecasters
 from .statistics import (
     Bootstrap,
@@ -13,11 +21,13 @@ from .statistics import (
 
 __all__ = [
     "Bootstrap",
+    "ClosedLoopSpread",
     "Difference",
     "FidelityRow",
     "FidelitySummary",
     "Interval",
     "by_attribute",
+    "closed_loop_spreads",
     "compare_closed_loops",
     "fitted",
     "holm",
@@ -26,4 +36,5 @@ __all__ = [
     "signed_rank_p",
     "summarise",
     "summarise_closed_loops",
+    "summarise_replays",
 ]

@@ -26,6 +26,7 @@ from lae_sim.trace.file import Trace
 from lae_sim.trace.recording import Recording, batched
 
 _GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
+_LEAST = 0.2  # weight of the farther of two strides beside a step
 _LANE_FRAMES = 1 << 21  # and of their repetitions
 
 
@@ -161,8 +162,8 @@ class _Job:
         farther = np.append(False, np.diff(frames) > (frames - before.take(frames))[1:])
         recorded = [RecordedAnswers(boxes, farther)]
         if self.passes:
-            for other in _beside(strides, frames):
-                recorded += phase_answers(other, passes[other], frames)
+            for other, weight in _beside(strides, frames).items():
+                recorded += phase_answers(other, passes[other], frames, weight)
         modelled = self.search.outcomes(self.recording, frames, recorded, self.image_size)
         return replace(run, modelled=modelled)
 
@@ -203,16 +204,21 @@ def _nearest(strides: Sequence[Fraction], frames: Ints) -> int:
     return min(range(len(strides)), key=lambda k: abs(strides[k] - step))
 
 
-def _beside(strides: Sequence[Fraction], frames: Ints) -> list[Fraction]:
-    """The strides next below and above the mean step of some processed frames.
+def _beside(strides: Sequence[Fraction], frames: Ints) -> dict[Fraction, float]:
+    """The strides next below and above the mean step of some processed frames, with weights.
 
-    The step from the initialisation does not count: a long one says nothing of those after it.
+    The nearer one weighs more; both weigh something, since steps differ from each other. The step
+    from the initialisation does not count: a long one says nothing of those after it.
     """
     after = frames[1:] if len(frames) > 2 else frames
     step = Fraction(int(after[-1] - after[0]), max(len(after) - 1, 1))
     below = max((stride for stride in strides if stride <= step), default=strides[0])
     above = min((stride for stride in strides if stride >= step), default=strides[-1])
-    return sorted({below, above})
+    if below == above:
+        return {below: 1.0}
+    share = float((step - below) / (above - below))
+    share = min(max(share, _LEAST), 1 - _LEAST)
+    return {below: 1 - share, above: share}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -19,7 +19,7 @@ distinct *outcomes* with their weights.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from math import ceil, inf, log
 
@@ -142,9 +142,8 @@ class SearchModel:
         Args:
             recording: the sequence, for the boxes of frames that own jumps went to.
             frames: processed frames, int64 [n].
-            recorded: recorded answers for these frames. The first are those that are replayed; they
-                weigh as much as all others together, which are of runs that are as likely: the
-                phases of the passes next to it.
+            recorded: recorded answers for these frames: those that are replayed, and those of other
+                runs that are likely.
             image_size: for the pre-forecaster.
         """
         jumps = [jump for jump in self.jumps.get(recording.name, ()) if _recorded(recording, jump)]
@@ -153,8 +152,9 @@ class SearchModel:
         rows = 1 if self.known else len(reaches)
         found: dict[bytes, tuple[Floats, float]] = {}
         weights: dict[bytes, Floats] = {}
-        for which, answers in enumerate(recorded):
-            share = 1.0 if len(recorded) == 1 else 0.5 if which == 0 else 0.5 / (len(recorded) - 1)
+        total = sum(answers.weight for answers in recorded)
+        for answers in recorded:
+            share = answers.weight / total
             walk = self._walker(recording, frames, answers, resumed, image_size)
             same_to = -inf
             for c, reach in enumerate(reaches.tolist()):
@@ -201,10 +201,12 @@ class RecordedAnswers:
     Attributes:
         boxes: float64 [n, 4].
         farther: whether the replay comes to a frame from farther back than the pass did, bool [n].
+        weight: how likely they are, compared with others.
     """
 
     boxes: Floats
     farther: Bools
+    weight: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +227,11 @@ class Outcomes:
     weights: Floats
     known: bool
     forecast: bool = False
+
+    @property
+    def likeliest(self) -> Floats:
+        """The boxes of the likeliest run, float64 [n, 4]; of the middle of an assumed range."""
+        return self.boxes[int(self.weights[len(self.weights) // 2].argmax())]
 
 
 class _Walk:
@@ -414,7 +421,9 @@ def find_search(
     return SearchModel(reaches, known, source, reach, jumps, pre_forecaster, keep_size)
 
 
-def phase_answers(stride: Fraction, recording: Recording, frames: Ints) -> list[RecordedAnswers]:
+def phase_answers(
+    stride: Fraction, recording: Recording, frames: Ints, weight: float
+) -> list[RecordedAnswers]:
     """What each phase of a pass recorded for some frames, as a run of its own.
 
     A pass holds the box of a frame from the first phase that processed it. A phase's boxes of other
@@ -424,6 +433,7 @@ def phase_answers(stride: Fraction, recording: Recording, frames: Ints) -> list[
         stride: of the pass.
         recording: of the pass.
         frames: int64 [n].
+        weight: of all phases together.
     """
     seen = np.zeros(len(recording), bool)
     answers = []
@@ -433,4 +443,4 @@ def phase_answers(stride: Fraction, recording: Recording, frames: Ints) -> list[
         columns = [np.interp(frames, own, column) for column in recording.boxes[own].T]
         farther = np.diff(frames, prepend=0) > ceil(stride)
         answers.append(RecordedAnswers(np.stack(columns, axis=1), farther))
-    return answers
+    return [replace(each, weight=weight / len(answers)) for each in answers]

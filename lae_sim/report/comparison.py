@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.comparison.fidelity import FidelityRow, FidelitySummary
+from lae_sim.comparison.fidelity import (
+    FAR_OFF,
+    REPEATED_WITHIN,
+    ClosedLoopSpread,
+    FidelityRow,
+    FidelitySummary,
+)
 from lae_sim.comparison.statistics import KEYS
 from lae_sim.report.table import (
     METRIC_LABELS,
+    PERCENT,
     SCORE,
     SIGNED,
     Column,
@@ -105,16 +113,19 @@ def _against(baseline: str) -> list[Column]:
 
 _REPLAYED = ("closed_loop", "forecaster", "replay")
 _FIDELITY = {
-    "closed_auc": "closed AUC",
-    "auc": "AUC",
-    "mean_abs_d_auc": "mean |d|",
-    "median_abs_d_auc": "median",
-    "max_abs_d_auc": "max",
-    "d_auc": "d",
-    "closed_dp20": "closed DP",
-    "dp20": "DP",
-    "mean_abs_d_dp20": "mean |d|",
-    "d_dp20": "d",
+    "closed_auc": ("closed AUC", SCORE),
+    "auc": ("AUC", SCORE),
+    "mean_abs_d_auc": ("mean |d|", SCORE),
+    "median_abs_d_auc": ("median", SCORE),
+    "max_abs_d_auc": ("max", SCORE),
+    "d_auc": ("d", SIGNED),
+    "covered": ("covered", PERCENT),
+    "width_auc": ("width", SCORE),
+    "closed_dp20": ("closed DP", SCORE),
+    "dp20": ("DP", SCORE),
+    "mean_abs_d_dp20": ("mean |d|", SCORE),
+    "d_dp20": ("d", SIGNED),
+    "covered_dp20": ("covered", PERCENT),
 }
 
 
@@ -129,10 +140,91 @@ def fidelity_table(rows: Sequence[FidelityRow] | Sequence[FidelitySummary]) -> s
     if not each:
         columns.append(Column("sequences", "sequences"))
     columns += [
-        Column(title, key, SIGNED if key.startswith("d_") else SCORE)
-        for key, title in _FIDELITY.items()
-        if hasattr(rows[0], key)
+        Column(title, key, _yes_or_no if each and key.startswith("covered") else form)
+        for key, (title, form) in _FIDELITY.items()
+        if any(getattr(row, key, None) is not None for row in rows)
     ]
     if each:
         columns += [Column("parted at", "parted"), Column("disagree", "disagreement", SCORE)]
     return text_of(Table.of(columns, rows))
+
+
+def _yes_or_no(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+def spread_table(spreads: Sequence[ClosedLoopSpread]) -> str:
+    """How far closed loops of one setting are apart: a line per setting and sequence."""
+    several = {each.trace for each in spreads}
+    columns = [Column("trace", "trace", is_label=True)] if len(several) > 1 else []
+    columns += [
+        Column("setting", "setting", is_label=True),
+        Column("forecaster", "forecaster", is_label=True),
+        Column("sequence", "sequence", is_label=True),
+        Column("closed loops", "closed_loops"),
+        Column("lowest AUC", "auc_low", SCORE),
+        Column("highest", "auc_high", SCORE),
+        Column("apart", "spread", SCORE),
+    ]
+    return text_of(Table.of(columns, spreads))
+
+
+_KINDS = {"strided": "strided passes", "every-frame": "recorded boxes alone"}
+
+
+def fidelity_verdicts(
+    rows: Sequence[FidelityRow], spreads: Sequence[ClosedLoopSpread]
+) -> list[str]:
+    """How far the replays of each tracker can be trusted, and where not: a sentence each.
+
+    Of several forecasters, it is the first that counts.
+    """
+    first = [row for row in rows if row.forecaster == rows[0].forecaster]
+    trackers = dict.fromkeys(row.tracker for row in first)
+    return [
+        _verdict(tracker, [row for row in first if row.tracker == tracker], spreads)
+        for tracker in trackers
+    ]
+
+
+def _verdict(tracker: str, rows: Sequence[FidelityRow], spreads: Sequence[ClosedLoopSpread]) -> str:
+    by_kind: dict[str, list[FidelityRow]] = {}
+    for row in rows:
+        if not is_unknown(row.d_auc):
+            by_kind.setdefault(row.replay, []).append(row)
+    if not by_kind:
+        return f"No sequence of {tracker} has a score."
+    off = {kind: fmean(abs(row.d_auc) for row in of) for kind, of in by_kind.items()}
+    best = next(kind for kind in ("modelled", "strided", "every-frame") if kind in off)
+    others = ", ".join(f"{name} {SCORE(off[kind])}" for kind, name in _KINDS.items()
+                       if kind in off and kind != best)  # fmt: skip
+    what = "Modelled replays" if best == "modelled" else f"Replays of {_KINDS[best]}"
+    said = f"{what} of {tracker} are within {SCORE(off[best])} AUC of its closed loops on average"
+    parts = [said + (f" ({others})" if others else "")]
+    counted = [row for row in by_kind[best] if row.covered is not None]
+    if counted:
+        share, count = fmean(bool(row.covered) for row in counted), len(counted)
+        known = all(row.c_known is not False for row in counted)
+        width = fmean((row.auc_high or 0.0) - (row.auc_low or 0.0) for row in counted)
+        spans = "95 % intervals cover" if known else "the range assumed of its reach covers"
+        parts.append(f"{spans} {share:.0%} of {count:,} closed-loop runs, {SCORE(width)} wide")
+    by_sequence: dict[str, list[float]] = {}
+    for row in by_kind[best]:
+        by_sequence.setdefault(row.sequence, []).append(abs(row.d_auc))
+    mine = {(row.trace, row.forecaster) for row in rows}
+    apart = {
+        each.sequence: None
+        for each in spreads
+        if (each.trace, each.forecaster) in mine and each.spread > REPEATED_WITHIN
+    }
+    far = [name for name, values in by_sequence.items() if fmean(values) > FAR_OFF]
+    doubts = [f"{', '.join(far)} (off by more than {FAR_OFF:g} on average)"] if far else []
+    if apart:
+        doubts.append(
+            f"{', '.join(apart)} (closed loops of one setting differ by more than "
+            f"{REPEATED_WITHIN:g} among themselves: a single figure is luck)"
+        )
+    where = f"do not trust them on {' and '.join(doubts)}" if doubts else (
+        f"on no sequence are they off by more than {FAR_OFF:g} on average"
+    )  # fmt: skip
+    return "; ".join([*parts, where]) + "."

@@ -303,7 +303,8 @@ def _modelled(scores: Scores, at: Sequence[int], draws: str | None) -> Modelled 
         rest = max(cell["unexplained"][metric] for cell in cells)
         low, high = interval(each, cells[0]["known"], rest, scores.modelled_sequences)
         if np.isfinite(low).all():
-            intervals[metric] = Interval(low.item(), high.item())
+            # in whatever chunks repetitions are dealt out, whose sums differ in the last bits
+            intervals[metric] = Interval(*(round(end.item(), 12) for end in (low, high)))
     outputs = scores.once["processed"]
     lost = float(scores.once["lost_share"] @ outputs / outputs.sum())
     return Modelled(cells[0]["known"], lost, means, intervals)
