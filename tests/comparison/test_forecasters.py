@@ -306,9 +306,9 @@ def test_passes_find_the_trace_of_their_tracker(slow: Trace, fast: Trace, tmp_pa
     alone = score_forecasters({"fast": fast}, {}, worlds)  # is asked to take it
     assert alone.attrs["search"][0]["c_known"]
     stranger = Trace(Metadata.new("30", "restarts", tracker={"name": "stranger"}), list(gaps))
+    strange = [World.of(passes=[stranger])]
     with pytest.raises(LaeError, match="a pass is of stranger on unknown: none of the traces"):
-        world = World.of(passes=[stranger])
-        score_forecasters({"slow": slow, "fast": fast}, {}, [world])
+        score_forecasters({"slow": slow, "fast": fast}, {}, strange)
 
 
 def test_what_is_trained_learns_from_the_recorded_boxes(slow: Trace) -> None:

@@ -54,7 +54,8 @@ def summary_row(**values):
 
 HEAD = [
     "trace", "tracker", "dataset", "device", "times_from", "policy", "fps", "latency", "scale",
-    "search", "pre_forecaster", "convention", "forecaster", "sequences", "repetitions", "engine", "exact",
+    "search", "pre_forecaster", "convention", "forecaster", "sequences", "repetitions", "engine",
+    "exact",
     "approximate_share", "elapsed_ms", "init_ms", "init_source", "skip_rate", "sigma",
     "auc", "dp20", "offline_auc", "offline_dp20",
 ]  # fmt: skip
