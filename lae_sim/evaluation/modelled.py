@@ -189,7 +189,7 @@ class Ranking:
         if all(known is None for known, _ in replays):
             return cls(False)
         if any(known is False for known, _ in replays):
-            return cls(False, "the reach is unknown, so the model's are for a range of it")
+            return cls(False, "the reach is unknown, and the model's are for a range of it")
         if any(known is None and not exact for known, exact in replays):
             return cls(False, "the search model says nothing of some approximate replays")
         return cls(True, "the reach is given or measured")

@@ -151,7 +151,7 @@ class StudyResults:
             if source.metadata.timing_note:
                 notes.append(f"{source.input.label}: times: {source.metadata.timing_note}")
         notes += [*self.init_sources(assumed=True), *self.training]
-        notes += [*self.search_sources(), *self.ranked_by()]
+        notes += self.search_sources()
         if any(scores.known is False for scores in self.scores):
             notes.append(
                 'measure c: lae-sim profile --gaps, then passes = ["TRACE.gaps.parquet"]; or name '

@@ -187,7 +187,7 @@ def test_an_assumed_range_does_not_rank() -> None:
     assert not beside.ranking.modelled
     assert beside.metrics == plain.metrics == ("auc", "dp20")
     assert beside.notes[-1] == (
-        "ranked by the scores of the recorded boxes: the reach is unknown, so the model's are for "
+        "ranked by the scores of the recorded boxes: the reach is unknown, and the model's are for "
         "a range of it"
     )
     assert any("measure c: lae-sim profile --gaps" in note for note in beside.notes)

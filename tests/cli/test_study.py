@@ -363,12 +363,15 @@ def test_a_known_reach_ranks_by_the_model_and_an_assumed_one_does_not(tmp_path: 
         a, b = (table.loc[(pair.search, each, pair.forecaster), name] for each in (pair.a, pair.b))
         assert pair.ranked_by == by_search[pair.search]
         assert pair.difference.value == pytest.approx(a.mean() - b.mean())
-    notes = results.notes()
-    assert "synthetic-slow: modelled: c = 0.3, as given" in notes
-    assert "ranked by the modelled scores: the reach is given or measured" in notes
-    assert any(note.startswith("ranked by the scores of the recorded boxes: ") for note in notes)
+    assert "synthetic-slow: modelled: c = 0.3, as given" in results.notes()
+    assert results.ranked_by() == [
+        "ranked by the modelled scores: the reach is given or measured",
+        "ranked by the scores of the recorded boxes: the reach is unknown, and the model's are for "
+        "a range of it",
+    ]
     off = run(tmp_path / "off", **{**FAR, "search": ("off",)})
-    assert not any("model" in note or "ranked" in note for note in off.notes())
+    assert not any("model" in note for note in off.notes())
+    assert off.ranked_by() == []
     recorded = {(r.trace, r.forecaster): r for r in results.summary if r.search == "off"}
     assert {(r.trace, r.forecaster): r for r in off.summary} == recorded
 
@@ -379,6 +382,7 @@ def test_the_tables_and_the_page_say_by_what_they_rank(tmp_path: Path) -> None:
     assert "ranked by" in printed.splitlines()[1]
     assert "modelled scores, and recorded" in printed.splitlines()[0]
     assert "not computed" not in printed
+    assert "the reach is given or measured" in " ".join(printed.split())
     one = study_command(toml(tmp_path, **{**keys, "search": "c=0.3"}), cwd=tmp_path)
     assert one.splitlines()[0].endswith("sigma 0, modelled scores")
     assert "Trackers against each other, by the modelled AUC" in one

@@ -301,7 +301,7 @@ def test_passes_find_the_trace_of_their_tracker(slow: Trace, fast: Trace, tmp_pa
     assert known == {"slow": True, "fast": False}
     assert table.attrs["ranking"] == {
         "modelled": False,
-        "reason": "the reach is unknown, so the model's are for a range of it",
+        "reason": "the reach is unknown, and the model's are for a range of it",
     }
     alone = score_forecasters({"fast": fast}, {}, worlds)  # is asked to take it
     assert alone.attrs["search"][0]["c_known"]

@@ -187,7 +187,7 @@ KNOWN, UNKNOWN, EXACT, SILENT = (True, False), (False, False), (None, True), (No
         ([SILENT, EXACT], False, ""),
         ([KNOWN], True, "the reach is given or measured"),
         ([KNOWN, EXACT, (True, True)], True, "the reach is given or measured"),
-        ([KNOWN, UNKNOWN], False, "the reach is unknown, so the model's are for a range of it"),
+        ([KNOWN, UNKNOWN], False, "the reach is unknown, and the model's are for a range of it"),
         ([KNOWN, SILENT], False, "the search model says nothing of some approximate replays"),
     ],
 )
