@@ -31,8 +31,8 @@ conventions are crossed:
                                          resample and lognormal are drawn anew in each repetition
   passes = ["nano.gaps.parquet"]         strided and gap passes, for traces of their tracker and
                                          dataset: as --strided in replay
-  search = ["c=0.7"]                     what the search model takes for the trackers' reach: as in
-                                         replay; "trace" (what the traces know) if left out, or "off"
+  search = ["c=0.7"]                     the trackers' reach, for the search model, as in replay:
+                                         "trace" (what the traces know) if left out, or "off"
   pre_forecaster = ["none", "kalman"]    what says where the trackers search, in the search model;
   keep_size = false                      whether it says the centre only
   init = ["300ms", "1s"]                 each with every latency: what the initialisation takes
