@@ -42,7 +42,7 @@ def _show(arguments: argparse.Namespace) -> None:
     from lae_sim import __version__
     from lae_sim.errors import LaeError
     from lae_sim.files import check_distinct
-    from lae_sim.report.reach import ReachReport, plot_reaches
+    from lae_sim.report.reach import ReachReport, reach_figure
     from lae_sim.report.trace import overview, plot_times
     from lae_sim.trace.describe import describe
     from lae_sim.trace.file import read_trace
@@ -77,6 +77,8 @@ def _show(arguments: argparse.Namespace) -> None:
         ]
         print("\n\n".join(texts))
     if arguments.plot and all(are_gaps):
-        plot_reaches([reach for reach in reaches if reach is not None], arguments.plot)
+        from lae_sim.report.style import save
+
+        save(reach_figure([reach for reach in reaches if reach is not None]), arguments.plot)
     elif arguments.plot:
         plot_times(described, arguments.plot)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.boxes import search_side
+from lae_sim.boxes import search_distance
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence
 from lae_sim.engine.clock import NS_PER_SECOND
 from lae_sim.errors import LaeError
@@ -188,15 +188,13 @@ def _valid(truth: Floats) -> Bools:
 
 def _pairs(truth: Floats) -> tuple[Ints, Ints, Floats]:
     """Start, gap and distance of every restart that may be sampled, [n] each."""
-    valid, side = _valid(truth), search_side(truth)
-    centre = truth[:, :2] + truth[:, 2:] / 2
+    valid = _valid(truth)
     starts, gaps, distances = [], [], []
     for gap in SAMPLED_GAPS:
         start = 1 + np.flatnonzero(valid[1:-gap] & valid[1 + gap :])
         starts.append(start)
         gaps.append(np.full(len(start), gap))
-        apart = np.abs(centre[start + gap] - centre[start]).max(axis=1, initial=0.0)
-        distances.append(apart / side[start])
+        distances.append(search_distance(truth[start], truth[start + gap]))
     return np.concatenate(starts), np.concatenate(gaps), np.concatenate(distances)
 
 
@@ -320,7 +318,7 @@ class Gaps:
     def _probed(self) -> tuple[float, float]:
         """What an initialisation and another call take with all around them, s; 0 if unknown."""
         count = len(self._sequences)
-        places = dict.fromkeys(k * (count - 1) // (_PROBES - 1) for k in range(_PROBES))
+        places = [k * (count - 1) // (_PROBES - 1) for k in range(_PROBES)]
         took = []
         for sequence in (self._sequences[place] for place in places):
             for start in own_starts(sequence, OWN_GAPS[:1]):

@@ -173,7 +173,7 @@ _KINDS = {"strided": "strided passes", "every-frame": "recorded boxes alone"}
 
 
 def fidelity_verdicts(
-    rows: Sequence[FidelityRow], spreads: Sequence[ClosedLoopSpread]
+    rows: Sequence[FidelityRow], spreads: Sequence[ClosedLoopSpread] = ()
 ) -> list[str]:
     """How far the replays of each tracker can be trusted, and where not: a sentence each.
 

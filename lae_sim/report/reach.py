@@ -21,13 +21,14 @@ from lae_sim.replay.reach import (
     own_jumps,
     restarts_of,
 )
-from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
+from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, styled
 from lae_sim.report.table import COUNT, PERCENT, Cell, Column, Table, printable, text_of
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Search
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 BIN_EDGES = (0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.5, math.inf)
 """Of the distances in tables, in units of ``search_side``."""
@@ -243,14 +244,14 @@ def _wilson(found: int, n: int) -> tuple[float, float]:
 
 
 @styled
-def plot_reaches(reports: Sequence[ReachReport], path: str) -> None:
-    """Draw a row for each gap pass: the share found by distance, and what own jumps came to."""
+def reach_figure(reports: Sequence[ReachReport]) -> Figure:
+    """A row for each gap pass: the share found by distance, and what own jumps came to."""
     figure = new_figure(10, 3.9 * len(reports))
     rows = figure.subplots(len(reports), 2, squeeze=False, width_ratios=(5, 3))
     for (left, right), report in zip(rows, reports):
         _draw_curve(left, report)
         _draw_jumps(right, report.jumps)
-    save(figure, path)
+    return figure
 
 
 def _draw_curve(axes: Axes, report: ReachReport) -> None:

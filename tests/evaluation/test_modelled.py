@@ -23,7 +23,7 @@ from lae_sim.replay.world import SIGMA_GRID, World
 SLOW = TRACES / "synthetic-slow.parquet"
 FORECASTERS = {"hold": Hold, "kalman": Kalman}
 REACH = Reach(0.3, 0.05, 0.01, 0.01, 1000)
-MEASURED = SearchModel(REACH.quantiles(40), True, "measured", REACH)
+MEASURED = SearchModel(REACH.quantiles(40), True, "drawn")
 
 
 def runs_of(search, latency="constant:100ms,init=500ms"):

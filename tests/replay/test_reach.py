@@ -63,6 +63,32 @@ def test_standard_errors_are_as_large_as_the_errors():
         assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.2, name
 
 
+def test_sequences_that_differ_widen_the_standard_errors():
+    """Each sequence has a reach of its own, as targets do: one curve is less sure than it seems."""
+    alike, unlike = [], []
+    for seed in range(100):
+        random = np.random.default_rng([9, seed])
+        reaches = random.logistic(0.7, 0.1, 12)
+        distances = random.uniform(0, 1.5, (12, 50))
+        unlike.append(
+            fit_reach(
+                Restart(f"s{k}", 1, 1, float(d), bool(d < reach))
+                for k, reach in enumerate(reaches)
+                for d in distances[k]
+            )
+        )
+        alike.append(
+            fit_reach(
+                Restart("a", 1, 1, float(d), bool(d < r))
+                for d, r in zip(distances.ravel(), random.logistic(0.7, 0.1, 600), strict=True)
+            )
+        )
+    wide, narrow = (np.median([fit.centre_error for fit in fits]) for fits in (unlike, alike))
+    assert wide > 2 * narrow
+    z = [(fit.centre - 0.7) / fit.centre_error for fit in unlike]
+    assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.3
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.permutations(drawn(0.7, 0.1, 60, seed=1)))
 def test_the_order_of_restarts_does_not_matter_to_the_last_bit(restarts):

@@ -18,7 +18,7 @@ from lae_sim.engine.scheduler import simulate
 from lae_sim.errors import LaeError
 from lae_sim.forecast.kalman import Kalman
 from lae_sim.replay.latency import constant
-from lae_sim.replay.reach import OwnJump
+from lae_sim.replay.reach import OwnJump, Reach
 from lae_sim.replay.run import Runs, replay_sequence
 from lae_sim.replay.search import RecordedAnswers, SearchModel, find_search, parse_search
 from lae_sim.replay.strides import phases
@@ -156,6 +156,32 @@ def test_a_lost_tracker_answers_what_it_answered_last(walk, c):
     assert np.array_equal(answers[1:][lost[1:]], answers[:-1][lost[1:]])
     for k in np.flatnonzero(lost):
         assert not near(boxes[k], answers[k - 1], c)
+
+
+@settings(max_examples=100, deadline=None)
+@given(walks(), st.floats(0, 3))
+def test_a_measured_reach_leaves_room_for_a_target_that_is_never_found_again(walk, c):
+    recording, frames = walk
+    boxes = recording.boxes[frames]
+    measured = model(c, reach=Reach(c, 0.1, 0.01, 0.01, 100))
+    found = measured.outcomes(recording, frames, recorded(recording, frames))
+    usual = plain(frames, boxes, c)
+    lost = np.flatnonzero(~(usual == boxes).all(axis=1))
+    first = int(lost[0]) - 1 if len(lost) else len(frames) - 1
+    never = boxes[np.minimum(np.arange(len(frames)), first)]
+    shares = {each.tobytes(): share for each, share in zip(found.boxes, found.weights[0])}
+    if never.tobytes() == usual.tobytes():
+        assert list(shares) == [usual.tobytes()]
+    else:
+        assert shares == {
+            usual.tobytes(): pytest.approx(0.9),
+            never.tobytes(): pytest.approx(0.1),
+        }
+    ahead = replace(measured, pre_forecaster=Kalman, keep_size=True)
+    for answers in ahead.outcomes(recording, frames, recorded(recording, frames)).boxes[1:]:
+        apart = np.flatnonzero(~(answers == boxes).all(axis=1))
+        assert (np.diff(apart) == 1).all()  # once lost it stays so
+        assert apart[-1] == len(frames) - 1
 
 
 # ------------------------------------------------------------- a tracker that obeys by construction

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from lae_sim.boxes import search_side
-from lae_sim.report.reach import ReachReport, _wilson, plot_reaches
+from lae_sim.report.reach import ReachReport, _wilson, reach_figure
+from lae_sim.report.style import save
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
@@ -71,7 +72,7 @@ def test_a_reach_that_is_not_known(restarts: list[Recording], said: str, tmp_pat
     report = ReachReport.of(gap_pass(*restarts))
     assert said in report.text()
     assert report.document()["centre"] is None
-    plot_reaches([report], str(tmp_path / "reach.svg"))
+    save(reach_figure([report]), str(tmp_path / "reach.svg"))
 
 
 @pytest.mark.parametrize(
@@ -109,5 +110,5 @@ def test_wilsons_interval_by_hand() -> None:
 def test_a_picture_of_several(tmp_path: Path) -> None:
     own = [restart("a@0+1", 0.2, [True]), restart("b@0+1", 0.9, [False])]
     reports = [ReachReport.of(gap_pass(*sampled(c), *own)) for c in (0.5, 0.9)]
-    plot_reaches(reports, str(tmp_path / "reach.svg"))
+    save(reach_figure(reports), str(tmp_path / "reach.svg"))
     assert (tmp_path / "reach.svg").read_text().count("<svg") == 1
