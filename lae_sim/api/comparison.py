@@ -24,11 +24,12 @@ from lae_sim.engine.clock import Number, whole
 from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.metrics import find_convention
+from lae_sim.evaluation.modelled import Ranking
 from lae_sim.files import sequence_names
-from lae_sim.learning.registry import load_any
+from lae_sim.learning.registry import load_any, load_forecaster
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
-from lae_sim.replay.world import SIGMA_GRID, World, label_of, named
+from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, label_of, named, open_others
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,15 +66,36 @@ class ComparisonResult:
     seed: int
 
     @property
-    def metrics(self) -> tuple[str, str]:
-        """The metrics that are compared."""
-        return ("mauc", "mdp20") if self.whole_grid else ("auc", "dp20")
+    def ranking(self) -> Ranking:
+        """By which scores forecasters are compared: the modelled ones, or the recorded boxes'."""
+        return Ranking(**self.scores.attrs["ranking"])
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """The metrics that are compared, the first with tests; others of the recorded boxes last.
+
+        ``("auc", "dp20")``, or ``("modelled_auc", "modelled_dp20", "auc", "dp20")``; over the grid
+        of sigmas their means, ``"mauc"``, ...
+        """
+        recorded = ("mauc", "mdp20") if self.whole_grid else ("auc", "dp20")
+        if not self.ranking.modelled:
+            return recorded
+        return (*(f"modelled_{metric}" for metric in recorded), *recorded)
 
     @property
     def notes(self) -> list[str]:
-        """What was trained, what initialisation costs, and which replays are approximations."""
+        """What was trained, what initialisation costs, which replays are approximations, ...
+
+        Where something is modelled the last says by what is ranked.
+        """
         notes: list[str] = self.scores.attrs["notes"]
-        return notes
+        return [*notes, str(self.ranking)] if self.search else notes
+
+    @property
+    def search(self) -> list[dict[str, Any]]:
+        """What the search model rests on in each replay of which it says something."""
+        search: list[dict[str, Any]] = self.scores.attrs["search"]
+        return search
 
     @property
     def init(self) -> list[dict[str, Any]]:
@@ -88,9 +110,31 @@ class ComparisonResult:
     def summary(self) -> DataFrame:
         """Means, paired differences and shares of the loss recovered, with intervals and tests.
 
-        See :func:`lae_sim.comparison.statistics.summarise`.
+        See :func:`lae_sim.comparison.statistics.summarise`. Where something is modelled there are
+        more columns: the search model's mean scores and the ends of their intervals,
+        ``modelled_auc``, ``modelled_auc_low``, ...; ``c_known`` and ``lost_share``; NaN where a
+        replay is exact, and in the rows of all traces.
         """
-        return summarise(self._compared, metrics=self.metrics, seed=self.seed)
+        return self._with_modelled(summarise(self._compared, metrics=self.metrics, seed=self.seed))
+
+    def _with_modelled(self, summary: DataFrame) -> DataFrame:
+        import pandas as pd
+
+        keys = ["trace", "latency", "scale", "sigma", "forecaster"]
+        rows = [
+            {
+                (key if key in (*keys, "c_known", "lost_share") else f"modelled_{key}"): value
+                for key, value in row.items()
+                if key != "over_sigmas"
+            }
+            for row in self.scores.attrs["modelled"]
+            if row["over_sigmas"] == self.whole_grid
+        ]
+        if not rows:
+            return summary
+        joined = summary.merge(pd.DataFrame(rows), on=keys, how="left")
+        joined.attrs |= summary.attrs
+        return joined
 
     @cached_property
     def attributes(self) -> DataFrame:
@@ -127,10 +171,11 @@ class ComparisonResult:
         table = self.summary[self.summary["metric"] == self.metrics[0]]
         first = table.drop_duplicates("forecaster")
         scores = ", ".join(f"{row.forecaster} {row.mean:.4f}" for row in first.itertuples())
+        score = "modelled AUC" if self.ranking.modelled else "AUC"
         setting = f"{first['trace'].iloc[0]}, {first['latency'].iloc[0]}"
         more = len(table.drop_duplicates(["trace", "latency", "scale", "sigma"])) - 1
         setting += f" and {more} more" * bool(more)
-        return " ".join(f"<ComparisonResult of {setting}: AUC {scores}>".split())
+        return " ".join(f"<ComparisonResult of {setting}: {score} {scores}>".split())
 
     def _repr_html_(self) -> str:
         from html import escape
@@ -155,6 +200,10 @@ def compare_forecasters(
     scale: Number | Sequence[Number] = 1,
     fps: Number | None = None,
     policy: str | Policy = "latest",
+    passes: TraceLike | Sequence[TraceLike] = (),
+    search: str = "trace",
+    pre_forecaster: str | None = None,
+    keep_size: bool = False,
     convention: str = "pysot",
     costs: Costs = (),
     sequences: str | Iterable[str] | None = None,
@@ -178,6 +227,10 @@ def compare_forecasters(
         sigma: permitted latencies in frames, or ``"grid"``, whose scores are compared as means.
         latency, scale: one or several, one after another, as in :func:`evaluate`.
         fps, policy, convention, costs, sequences: as in :func:`evaluate`.
+        passes, search, pre_forecaster, keep_size: as in :func:`evaluate`; of several traces, each
+            pass goes with those of its tracker and dataset. Forecasters are compared by the
+            modelled scores where the reach is known (see
+            :class:`lae_sim.evaluation.modelled.Ranking`).
         root, dataset, camera_lag: the frames, for ``camera+NAME`` (see
             :func:`lae_sim.learning.registry.find_camera`).
         folds: in how many parts the sequences are dealt out, if anything is trained.
@@ -214,8 +267,12 @@ def compare_forecasters(
         latency=latency,
         scale=scale,
         sigma=sigma,
+        search=search,
+        pre_forecaster=pre_forecaster,
+        keep_size=keep_size,
         convention=convention,
         costs=cost_texts(costs),
+        **open_others(None, passes),
     )
     find_convention(convention)
     if len({(world.fps, label_of(world.policy)) for world in worlds}) > 1:
@@ -229,6 +286,7 @@ def compare_forecasters(
         name: load_any(each, camera) if isinstance(each, str) else each
         for name, each in {"hold": "hold", **makers}.items()
     }
+    searches = None if pre_forecaster is None else load_forecaster(pre_forecaster, camera)
     total, done = steps(opened, ready, worlds, folds), 0
     with ProgressBar("compare", "steps", progress) as bar:
 
@@ -237,5 +295,5 @@ def compare_forecasters(
             done += 1
             bar(done, total, what)
 
-        scores = score_forecasters(opened, ready, worlds, folds, seed, advance)
+        scores = score_forecasters(opened, ready, worlds, folds, seed, advance, searches)
     return ComparisonResult(opened, scores, worlds[0].sigmas == SIGMA_GRID, seed)

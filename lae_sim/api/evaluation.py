@@ -32,7 +32,7 @@ from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
 from lae_sim.evaluation.modelled import MODELLED
-from lae_sim.evaluation.totals import Totals
+from lae_sim.evaluation.totals import Totals, search_report
 from lae_sim.files import sequence_names
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes, resolve_costs
@@ -41,12 +41,7 @@ from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import TraceLike, World, label_of, named, open_others
-from lae_sim.report.replay import (
-    SequenceRows,
-    attribute_members,
-    search_report,
-    trace_report,
-)
+from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
 from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
 

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli.options import (
     add_forecasting,
+    add_passes,
+    add_search,
     add_worlds,
     argument,
     exit_status,
@@ -33,6 +35,8 @@ examples:
   lae-sim compare nano.parquet --latency constant:47ms,init=800ms by-call,init=1s
   lae-sim compare nano.parquet --latency-scale 1/2 1 2 4 --forecaster kalman learned --attributes
   lae-sim compare nano.parquet --forecaster kalman camera+kalman --root ~/data/DTB70 --out all.csv
+  lae-sim compare nano.parquet --latency constant:47ms --search c=0.7 --pre-forecaster kalman
+  lae-sim compare nano.parquet dcf.parquet --strided nano.gaps.parquet dcf.gaps.parquet
   lae-sim compare nano.parquet --forecaster kalman mine:Midway --cost mine:Midway=2ms --json
 
 {FORECASTERS}\
@@ -56,8 +60,10 @@ def parser() -> argparse.ArgumentParser:
         help="see below (default: kalman least-squares tuned-kalman); hold is always compared",
     )
     add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
+    add_passes(add)
     add_forecasting(made)
     add_worlds(made, [Fraction(1)])
+    add_search(made)
     scores = made.add_argument_group("scores")
     add = scores.add_argument
     sigma = scores.add_mutually_exclusive_group()
@@ -106,6 +112,10 @@ def _compare(arguments: argparse.Namespace) -> None:
         scale=arguments.latency_scale,
         fps=arguments.fps,
         policy=arguments.policy,
+        passes=arguments.strided,
+        search=arguments.search,
+        pre_forecaster=arguments.pre_forecaster,
+        keep_size=arguments.keep_size,
         convention=arguments.convention,
         costs=arguments.cost,
         sequences=arguments.sequence,
@@ -127,7 +137,7 @@ def _compare(arguments: argparse.Namespace) -> None:
     if arguments.sigma_grid:
         tables = {name: table.assign(sigma="0, 0.02, ..., 1") for name, table in tables.items()}
     if arguments.json:
-        document = {
+        document: dict[str, Any] = {
             "format": "lae-compare",
             "version": "1.0",
             "lae_sim": __version__,
@@ -136,10 +146,13 @@ def _compare(arguments: argparse.Namespace) -> None:
             "policy": arguments.policy,
             "seed": arguments.seed,
             "method": result.summary.attrs["method"],
+            "ranked_by": result.ranking.by,
+            "search": result.search,
             "init": result.init,
             "notes": result.notes,
             **{name: _records(table) for name, table in tables.items()},
         }
+        document["summary"] = [_with_modelled(row) for row in document["summary"]]
         print(json.dumps(document, indent=2, allow_nan=False))
         return
     for table in reversed(tables.values()):
@@ -151,7 +164,7 @@ def _compare(arguments: argparse.Namespace) -> None:
 def _check_files(arguments: argparse.Namespace, traces: Sequence[str]) -> None:
     """Refuse what would only fail after the work."""
     outputs = [path for path in (arguments.out, arguments.plot) if path]
-    check_distinct(outputs, traces)
+    check_distinct(outputs, [*traces, *arguments.strided])
     check_folders(outputs)
     if arguments.out and Path(arguments.out).suffix not in (".csv", ".parquet"):
         raise LaeError(f"--out {arguments.out}: name a .csv or .parquet file")
@@ -176,3 +189,13 @@ def _records(table: DataFrame) -> list[dict[str, Any]]:
     """The rows as JSON objects, NaN as null."""
     rows: list[dict[str, Any]] = table.to_dict("records")
     return [{k: None if v != v else v for k, v in row.items()} for row in rows]
+
+
+def _with_modelled(row: dict[str, Any]) -> dict[str, Any]:
+    """A row of the summary, with what is modelled in an object of its own."""
+    modelled = {
+        key.removeprefix("modelled_"): row.pop(key)
+        for key in [*row]
+        if key.startswith("modelled_") or key in ("c_known", "lost_share")
+    }
+    return {**row, "modelled": modelled if modelled.get("c_known") is not None else None}

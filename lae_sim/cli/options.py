@@ -41,6 +41,12 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
         + (", or by several, one after another" if sweeps else ""),
     )
     add("--timing", metavar="TRACE", help="take the times from another device's trace")
+
+    add_passes(add)
+
+
+def add_passes(add: Callable[..., argparse.Action]) -> None:
+    """Add further passes of the tracker, by what adds to a parser or a group."""
     add(
         "--strided",
         nargs="+",

@@ -29,6 +29,12 @@ conventions are crossed:
   fps = ["trace", 60]                    world frame rates; "trace" is each trace's own
   latencies = ["recorded", "bootstrap"]  also by-call, constant:47ms; bootstrap (in blocks),
                                          resample and lognormal are drawn anew in each repetition
+  passes = ["nano.gaps.parquet"]         strided and gap passes, for traces of their tracker and
+                                         dataset: as --strided in replay
+  search = ["c=0.7"]                     the trackers' reach, for the search model, as in replay:
+                                         "trace" (what the traces know) if left out, or "off"
+  pre_forecaster = ["none", "kalman"]    what says where the trackers search, in the search model;
+  keep_size = false                      whether it says the centre only
   init = ["300ms", "1s"]                 each with every latency: what the initialisation takes
   scales = [0.5, 1, 2]                   exact factors on all times; 2 is a device half as fast
   sigma = "grid"                         0, 0.02, ..., 1 (mAUC and mDP), or a list such as [0, 0.5]

@@ -183,13 +183,14 @@ def summarise(
     Args:
         table: the tidy table; a column ``attribute`` divides the groups further.
         baselines: forecasters that the others are compared with, where the table has them.
-        metrics: those to summarise.
+        metrics: those to summarise, in the order of the rows.
         resamples, seed: of the :class:`Bootstrap`.
         confidence: of the intervals, between 0 and 1.
 
     Returns:
-        One row per trace, latency, scale, sigma, forecaster and metric, each in the order of its
-        first appearance, with ``sequences`` (how many count), ``mean``, ``low``, ``high`` and:
+        One row per trace, latency, scale, sigma, forecaster and metric, each (metrics apart) in the
+        order of its first appearance, with ``sequences`` (how many count), ``mean``, ``low``,
+        ``high`` and:
 
         - per baseline ``vs_hold``, ``vs_hold_low``, ``vs_hold_high`` (the mean paired difference),
           ``vs_hold_p`` (:func:`signed_rank_p`), ``vs_hold_better``, ``vs_hold_worse`` (numbers of
@@ -263,10 +264,16 @@ def over_sigmas(table: pd.DataFrame) -> pd.DataFrame:
     """The tidy table of the plain means over permitted latencies: metrics mauc, mdp20, ...
 
     Over 0, 0.02, ..., 1 these are mAUC and mDP of Li et al., "PVT++", 2023. ``sigma`` is 0 in all.
+    Of modelled scores they are ``modelled_mauc``, ...
     """
     keys = [column for column in table if column not in ("sigma", "value")]
     means = table.groupby(keys, sort=False)["value"].mean().reset_index()
-    return means.assign(metric="m" + means["metric"], sigma=0.0)
+    return means.assign(metric=means["metric"].map(mean_over_sigmas), sigma=0.0)
+
+
+def mean_over_sigmas(metric: str) -> str:
+    """The name of a metric's mean over permitted latencies."""
+    return f"modelled_m{metric[9:]}" if metric.startswith("modelled_") else f"m{metric}"
 
 
 def _wide(table: pd.DataFrame, metrics: Sequence[str]) -> tuple[pd.DataFrame, dict[str, list[Any]]]:
@@ -279,6 +286,7 @@ def _wide(table: pd.DataFrame, metrics: Sequence[str]) -> tuple[pd.DataFrame, di
     table = table[table["metric"].isin(list(metrics))]
     keys = [key for key in KEYS if key in table]
     order = {key: list(table[key].unique()) for key in keys}
+    order["metric"] = [metric for metric in metrics if metric in order["metric"]]
     rows = [*(key for key in keys if key != "forecaster"), "dataset", "sequence"]
     try:
         wide = table.set_index([*rows, "forecaster"])["value"].unstack("forecaster")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -44,6 +45,32 @@ class SkippedStalls:
 def left_search(replay: ReplayStatistics) -> list[str]:
     """The sequences whose target leaves the search region during the initialisation."""
     return [name for name, left in zip(replay.sequences, replay.left_search) if left]
+
+
+def search_notes(search: Mapping[str, Any]) -> list[str]:
+    """What modelled figures rest on, in lines.
+
+    Args:
+        search: what :func:`lae_sim.evaluation.totals.search_report` gives.
+    """
+    interval = "an interval of 95 %" if search["c_known"] else "the ends of that range"
+    lines = [
+        "modelled: a target is found within c search sides of where the tracker searches; "
+        f"{search['source']};",
+        f"lost for {100 * search['lost_share']:.3g}% of the outputs; [low, high]: {interval}",
+    ]
+    if search["pre_forecaster"] is not None:
+        kept = ", the size is kept" if search["keep_size"] else ""
+        lines.append(
+            f"pre-forecaster {search['pre_forecaster']} says where the tracker searches{kept}: "
+            "the model's figures alone"
+        )
+    if not search["c_known"]:
+        lines.append(
+            "measure c: lae-sim profile --gaps, then --strided TRACE.gaps.parquet; or name it: "
+            "--search c=0.7"
+        )
+    return lines
 
 
 def notes_on(

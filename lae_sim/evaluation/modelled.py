@@ -10,7 +10,7 @@ end, the middle and the high end of its range are three figures of the whole dat
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -151,6 +151,57 @@ def interval(draws: Floats, known: bool, unexplained: float, applies: int) -> tu
     # what is unexplained is independent from sequence to sequence
     rest = unexplained * np.sqrt(applies) / np.maximum(counts.max(axis=1), 1)
     return np.maximum(low - rest, 0.0), np.minimum(high + rest, 1.0)
+
+
+def over_sigmas(draws: Floats) -> Floats:
+    """Joint draws of the plain means over the permitted latencies, float64 [..., 1]."""
+    sums, counts = draws
+    means = (sums / np.where(counts > 0, counts, np.nan)).mean(axis=-1, keepdims=True)
+    known, most = ~np.isnan(means), counts.max(axis=-1, keepdims=True)
+    return np.stack([np.where(known, means * most, 0.0), np.where(known, most, 0.0)])
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """By which of its two scores replays are ranked, and compared in tests.
+
+    The modelled ones say what a tracker would have answered, so they decide, but only if no range
+    that somebody assumed does, and no figure of the one kind is held against one of the other. So
+    all replays must be exact, where both are the same, or of a reach that was given or measured.
+
+    Attributes:
+        modelled: whether it is by the modelled scores; by those of the recorded boxes otherwise.
+        reason: why, in words; empty where there is no choice, since nothing is modelled.
+    """
+
+    modelled: bool
+    reason: str = ""
+
+    @classmethod
+    def of(cls, replays: Iterable[tuple[bool | None, bool]]) -> Ranking:
+        """That of some replays.
+
+        Args:
+            replays: of each whether the reach is known (see :class:`ModelledScores`), and whether
+                it is exact.
+        """
+        replays = list(replays)
+        if all(known is None for known, _ in replays):
+            return cls(False)
+        if any(known is False for known, _ in replays):
+            return cls(False, "the reach is unknown, and the model's are for a range of it")
+        if any(known is None and not exact for known, exact in replays):
+            return cls(False, "the search model says nothing of some approximate replays")
+        return cls(True, "the reach is given or measured")
+
+    @property
+    def by(self) -> str:
+        """``"modelled"`` or ``"recorded"``."""
+        return "modelled" if self.modelled else "recorded"
+
+    def __str__(self) -> str:
+        scores = "modelled scores" if self.modelled else "scores of the recorded boxes"
+        return f"ranked by the {scores}" + (f": {self.reason}" if self.reason else "")
 
 
 def summed(draws: Sequence[Floats]) -> Floats:

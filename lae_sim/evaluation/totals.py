@@ -8,13 +8,15 @@ sums.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.evaluation.evaluate import Curves, Evaluation, ReplayStatistics, Staleness
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.modelled import MODELLED, interval, summed
+from lae_sim.evaluation.modelled import MODELLED, interval, over_sigmas, summed
+from lae_sim.replay.search import SearchModel
 
 RECOVERED = ("auc", "dp20")
 """The metrics of which a share of the latency loss can be recovered."""
@@ -143,13 +145,14 @@ class ModelledTotals:
     Attributes:
         known: see :class:`.modelled.ModelledScores`.
         applies: number of sequences whose replay is not exact.
+        unexplained: see :class:`.modelled.ModelledScores`.
     """
 
     def __init__(self, hold: int) -> None:
         """With the index of the forecaster that others are to do better than."""
         self.known: bool | None = None
         self.applies = 0
-        self._unexplained: Mapping[str, float] = {}
+        self.unexplained: Mapping[str, float] = {}
         self._hold = hold
         self._draws: dict[str, list[Floats]] = {metric: [] for metric in MODELLED}
         self._scores = {metric: Mean() for metric in MODELLED}
@@ -161,7 +164,7 @@ class ModelledTotals:
         """Add the sequences of a part."""
         modelled, outputs = part.modelled, part.replay.processed
         if self.known is None:
-            self.known, self._unexplained = modelled.known, modelled.unexplained
+            self.known, self.unexplained = modelled.known, modelled.unexplained
         self.applies += int(modelled.applies.sum())
         self._outputs += float(outputs.sum())
         self._lost_outputs += float(modelled.lost_share @ outputs)
@@ -181,18 +184,54 @@ class ModelledTotals:
         """Share of the outputs answered while the target is lost, 0..1."""
         return self._lost_outputs / self._outputs if self._outputs else 0.0
 
-    def mean(self, metric: str) -> Floats:
-        """Mean scores, float64 [F, M]."""
-        return self._scores[metric].value
-
-    def interval(self, metric: str) -> tuple[Floats, Floats]:
-        """The low and the high end of the mean scores, each float64 [F, M]."""
+    def draws(self, metric: str) -> Floats:
+        """Joint draws over all sequences, float64 [2, F, J, M] (see :class:`.ModelledScores`)."""
         (draws,) = self._draws[metric]
-        return interval(draws, bool(self.known), self._unexplained[metric], self.applies)
+        return draws
+
+    def figures(self, over_grid: bool = False) -> dict[str, Floats]:
+        """Mean scores, and the ends of their intervals: auc, auc_low, auc_high, dp20, ...
+
+        Args:
+            over_grid: whether they are of the plain means over the permitted latencies.
+
+        Returns:
+            float64 [F, M]; with ``over_grid`` [F, 1].
+        """
+        figures: dict[str, Floats] = {}
+        for metric in MODELLED:
+            draws = self.draws(metric)
+            mean = self._scores[metric].value
+            if over_grid:
+                draws, mean = over_sigmas(draws), mean.mean(axis=1, keepdims=True)
+            ends = interval(draws, bool(self.known), self.unexplained[metric], self.applies)
+            figures |= dict(zip((metric, f"{metric}_low", f"{metric}_high"), (mean, *ends)))
+        return figures
 
     def recovered(self, metric: str) -> tuple[Floats, Floats]:
         """How much better than hold, and how much better the offline scores are, [F, M] each."""
         return self._won[metric].total, self._lost[metric].total
+
+
+def search_report(
+    search: SearchModel | None, pre_forecaster: str | None, totals: ModelledTotals
+) -> dict[str, Any] | None:
+    """What the search model rests on; None where it says nothing of a trace."""
+    if search is None or totals.known is None:
+        return None
+    reach = search.reach
+    return {
+        "source": search.source,
+        "c_known": search.known,
+        "c_low": float(search.reaches[0]) if np.isfinite(search.reaches[0]) else None,
+        "c_high": float(search.reaches[-1]) if np.isfinite(search.reaches[-1]) else None,
+        "reach": None if reach is None else {"centre": reach.centre, "spread": reach.spread},
+        "own_jumps": len(search.jumps),
+        "pre_forecaster": pre_forecaster,
+        "keep_size": search.keep_size,
+        "sequences": totals.applies,
+        "lost_share": totals.lost_share,
+    }
 
 
 class Totals:

@@ -300,8 +300,7 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
     """Replay a trace again and again, under other random times in each repetition.
 
     Args:
-        runs: of a trace with random times, without strided passes; the repetition of their source
-            does not count.
+        runs: of a trace with random times; the repetition of their source does not count.
         count: number of repetitions.
         first: the first repetition.
 
@@ -315,9 +314,9 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
             there.
     """
     source = runs.source
-    if not isinstance(source, RandomSource) or runs.strided:
+    if not isinstance(source, RandomSource):
         raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
-    for jobs in batched(_jobs(runs.trace, runs.timing, (), runs.search), _GROUP_FRAMES):
+    for jobs in batched(_jobs(runs.trace, runs.timing, runs.strided, runs.search), _GROUP_FRAMES):
         size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
         for begin in range(first, first + count, size):
             some = range(begin, min(begin + size, first + count))

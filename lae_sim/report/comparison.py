@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
@@ -37,8 +38,9 @@ Row = Mapping[str, Any]
 def comparison_table(summary: pd.DataFrame) -> str:
     """The summary as text: a line per trace, setting and forecaster, then how it was computed.
 
-    The first metric has intervals and tests, the others have their means. ``summary`` is what
-    :func:`summarise` or :func:`by_attribute` gave, or some rows of it.
+    The first metric has intervals and tests, the others have their means; the search model's means
+    have its own intervals. ``summary`` is what :func:`summarise` or :func:`by_attribute` gave, or
+    some rows of it, perhaps with the columns of the model.
     """
     first, *others = summary["metric"].unique()
     baselines = [name[3:-7] for name in summary if name.endswith("_better")]
@@ -64,6 +66,14 @@ def comparison_table(summary: pd.DataFrame) -> str:
         *(column for baseline in baselines for column in _against(baseline)),
         *(Column(METRIC_LABELS.get(name, name), mean_of(name), SCORE) for name in others),
     ]
+    modelled = [
+        name[:-4] for name in summary if name.startswith("modelled_") and name[-4:] == "_low"
+    ]
+    if first in modelled:  # whose interval is that over sequences
+        at = next(i for i, column in enumerate(columns) if column.value == "mean") + 1
+        columns.insert(at, Column("[low, high]", partial(_ends, first)))
+    else:
+        columns += [Column(METRIC_LABELS[name], name, SCORE) for name in modelled]
     rows = (
         summary[summary["metric"] == first]
         .rename(columns={"low": "mean_low", "high": "mean_high"})
@@ -75,10 +85,16 @@ def comparison_table(summary: pd.DataFrame) -> str:
         for baseline in baselines:
             if row["forecaster"] == baseline:
                 row[f"vs_{baseline}"] = None
-    intervals = (METRIC_LABELS.get(first, first), "recovered")
+    intervals = [METRIC_LABELS.get(name, name) for name in (first, *modelled)]
     caption = ", ".join(shared) + "\n\n" if shared else ""
     method = f"\n{summary.attrs['method']}" if "method" in summary.attrs else ""
-    return caption + text_of(Table.of(columns, rows), intervals) + method
+    return caption + text_of(Table.of(columns, rows), [*intervals, "recovered"]) + method
+
+
+def _ends(name: str, row: Row) -> str | None:
+    """The ends of an interval."""
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return None if is_unknown(low) else f"[{SCORE(low)}, {SCORE(high)}]"
 
 
 def _against(baseline: str) -> list[Column]:

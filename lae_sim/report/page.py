@@ -152,6 +152,7 @@ def _facts(view: View) -> dict[str, str]:
         "cells": f"{len(results.plan.cells):,}, {len(results.failures):,} pieces failed",
         "repetitions": f"{repeated:,} of random latencies" if repeated > 1 else "1",
         "replays": replays,
+        **_search_facts(results),
         "initialisation": "; ".join(results.init_sources()),
         "uncertainty": "[ ]: 95 % percentile bootstrap over sequences, seed "
         f"{results.plan.study.seed}",
@@ -163,6 +164,13 @@ def _facts(view: View) -> dict[str, str]:
         if source.metadata.timing_note
     ]
     return {**facts, **({"times": "; ".join(made_up)} if made_up else {})}
+
+
+def _search_facts(results: StudyResults) -> dict[str, str]:
+    """What modelled scores rest on, and by what is ranked; empty where nothing is modelled."""
+    if not (sources := results.search_sources()):
+        return {}
+    return {"search model": "; ".join(sources), "ranking": "; ".join(results.ranked_by())}
 
 
 def _sections(view: View) -> Iterator[Section]:

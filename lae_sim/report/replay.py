@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 
 from lae_sim.engine.clock import Clock
-from lae_sim.evaluation.caveats import left_search
+from lae_sim.evaluation.caveats import left_search, search_notes
 from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED
 from lae_sim.evaluation.totals import RECOVERED, ModelledTotals, ScoreTotals, Totals, recovered
-from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.table import (
     CHANGE,
@@ -138,47 +137,26 @@ def _scores(totals: ScoreTotals, forecasters: Sequence[str]) -> list[list[Report
     return [[one(f, s) for s in range(count)] for f in range(len(forecasters))]
 
 
-def search_report(
-    search: SearchModel | None, pre_forecaster: str | None, totals: ModelledTotals
-) -> Report | None:
-    """What the search model rests on; None where it says nothing of a trace."""
-    if search is None or totals.known is None:
-        return None
-    reach = search.reach
-    return {
-        "source": search.source,
-        "c_known": search.known,
-        "c_low": float(search.reaches[0]) if np.isfinite(search.reaches[0]) else None,
-        "c_high": float(search.reaches[-1]) if np.isfinite(search.reaches[-1]) else None,
-        "reach": None if reach is None else {"centre": reach.centre, "spread": reach.spread},
-        "own_jumps": len(search.jumps),
-        "pre_forecaster": pre_forecaster,
-        "keep_size": search.keep_size,
-        "sequences": totals.applies,
-        "lost_share": totals.lost_share,
-    }
-
-
 def _modelled(
     totals: ModelledTotals, forecasters: Sequence[str], complete: bool
 ) -> list[list[Report]] | None:
     """Scores under the search model by forecaster and sigma; None where it says nothing."""
     if totals.known is None:
         return None
-    means = {metric: (totals.mean(metric), *totals.interval(metric)) for metric in MODELLED}
+    figures = totals.figures()
     changes = {metric: totals.recovered(metric) for metric in MODELLED}
 
     def one(f: int, s: int) -> Report:
         scores: Report = {"c_known": totals.known}
         for metric in MODELLED:
-            for end, values in zip(("", "_low", "_high"), means[metric]):
-                scores[f"{metric}{end}"] = _number(values[f, s])
+            for name in (metric, f"{metric}_low", f"{metric}_high"):
+                scores[name] = _number(figures[name][f, s])
             won, lost = (float(values[f, s]) for values in changes[metric])
             comparable = complete and forecasters[f] != "hold"
             scores[f"recovered_{metric}"] = recovered(won, lost) if comparable else None
         return {**scores, "lost_share": totals.lost_share}
 
-    count = means[MODELLED[0]][0].shape[1]
+    count = figures[MODELLED[0]].shape[1]
     return [[one(f, s) for s in range(count)] for f in range(len(forecasters))]
 
 
@@ -389,7 +367,7 @@ def settings_text(report: Report) -> str:
     lines += [_wrapped(note) for note in report["notes"]]
     share = f"{report['approximate_outputs']:,} outputs ({100 * report['approximate_share']:.3g}%)"
     if report["search"] is not None:
-        lines += _search_text(report["search"])
+        lines += [f"  {line}" for line in search_notes(report["search"])]
     if report["exact"]:
         lines.append("  exact: every output follows the same frame as when it was recorded")
     elif report["strided"]:
@@ -403,28 +381,6 @@ def settings_text(report: Report) -> str:
             "a stateful\n  tracker would have seen larger motion there, so this is optimistic"
         )
     return "\n".join(lines)
-
-
-def _search_text(search: Report) -> list[str]:
-    """What the modelled figures rest on, in lines."""
-    interval = "an interval of 95 %" if search["c_known"] else "the ends of that range"
-    lines = [
-        "  modelled: a target is found within c search sides of where the tracker searches; "
-        f"{search['source']};",
-        f"  lost for {100 * search['lost_share']:.3g}% of the outputs; [low, high]: {interval}",
-    ]
-    if search["pre_forecaster"] is not None:
-        kept = ", the size is kept" if search["keep_size"] else ""
-        lines.append(
-            f"  pre-forecaster {search['pre_forecaster']} says where the tracker searches{kept}: "
-            "the model's figures alone"
-        )
-    if not search["c_known"]:
-        lines.append(
-            "  measure c: lae-sim profile --gaps, then --strided TRACE.gaps.parquet; or name it: "
-            "--search c=0.7"
-        )
-    return lines
 
 
 def _wrapped(note: str) -> str:

@@ -7,7 +7,7 @@ there are no trackers to tell apart. Pictures that would hold too much choose, a
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from lae_sim.comparison.statistics import ALL_TRACES, Interval
 from lae_sim.engine.clock import parse_duration, split_init
+from lae_sim.replay.search import ReachRange, parse_search
 from lae_sim.report.figures import Curve, Line, Panel, draw_curves, draw_sweep
 from lae_sim.report.study_view import SETTINGS, View, run_of, setting_of, shared_setting
 from lae_sim.report.style import (
@@ -80,7 +81,7 @@ def _best_runs(view: View, rows: Sequence[SummaryRow]) -> tuple[list[str], str]:
     """The runs of the best trackers, as many as a panel may hold, and what was left out."""
     best: dict[str, float] = {}
     for row in rows:
-        best[run_of(row)] = max(best.get(run_of(row), 0), row.scores["auc"] or 0)
+        best[run_of(row)] = max(best.get(run_of(row), 0), row.score("auc") or 0)
     shown = max(1, MOST_CURVES // len(view.forecasters))
     kept = sorted(best, key=lambda run: -best[run])[:shown]
     left_out = f"; the best {len(kept)} of {len(best)} trackers" if len(kept) < len(best) else ""
@@ -100,13 +101,19 @@ def curves(view: View) -> Iterator[Picture]:
         shown = [scores for scores in group if scores.setting.run in kept]
         rows = [view.row_of(scores) for scores in shown]
         yield Picture(
-            f"{printable(rows[0].dataset)}: {shared_setting(rows)}{left_out}. In brackets: AUC, "
+            f"{printable(rows[0].dataset)}: {_recorded(rows)}{left_out}. In brackets: AUC, "
             "and precision at 20 px.",
             svg_of(draw_curves([curve for scores in shown for curve in _curves(view, scores)])),
         )
     if len(ordered) > MOST_PAIRS:
         left = len(ordered) - MOST_PAIRS
         yield Picture(f"{left} more settings are in the ranking, and not drawn here.", b"")
+
+
+def _recorded(rows: Sequence[SummaryRow]) -> str:
+    """The setting of curves, which are of the recorded boxes whatever is ranked."""
+    shared = shared_setting([replace(row, ranked_by="recorded") for row in rows])
+    return shared + (", of the recorded boxes" if any(row.modelled for row in rows) else "")
 
 
 def _curves(view: View, scores: Scores) -> Iterator[Curve]:
@@ -129,6 +136,7 @@ SWEEPS = {
     "fps": "world rate (frames/s)",
     "latency": "constant latency (ms)",
     "init": "time of an initialisation (ms)",
+    "search": "reach c (search sides)",
 }
 """What scores are drawn over, if a study has several: the key of the summary, and its label."""
 
@@ -168,6 +176,9 @@ def _place(row: SummaryRow, key: str, chosen: str) -> float | None:
             return None if init_ns is None or times != its_times else init_ns / 1e6
         kind, _, time = times.partition(":")
         return parse_duration(time) / 1e6 if (kind, init_ns) == ("constant", its_init_ns) else None
+    if key == "search":
+        reach = parse_search(row.search)
+        return reach.low if isinstance(reach, ReachRange) and reach.low == reach.high else None
     value = getattr(row, key)
     return float(value) if isinstance(value, Fraction) else None
 
@@ -188,7 +199,7 @@ def _sweep_panels(
             Line(
                 _label(view, *which),
                 [x for x, _ in lines[which]],
-                np.array([row.scores[metric] for _, row in lines[which]], np.float64),
+                np.array([row.score(metric) for _, row in lines[which]], np.float64),
                 styles[which],
             )
             for which in order
@@ -201,7 +212,7 @@ def front(view: View) -> Picture | None:
     points = [
         Point(row, row.elapsed_ms, auc)
         for row in view.standing
-        if row.elapsed_ms is not None and (auc := row.scores["auc"]) is not None
+        if row.elapsed_ms is not None and (auc := row.score("auc")) is not None
     ]
     if not points:
         return None
@@ -268,7 +279,7 @@ def gains(view: View) -> Picture | None:
     """What each forecaster wins over hold for each tracker; None if there is only hold."""
     best: dict[str, float] = {}
     for row in view.standing:
-        if "auc" in row.uncertainty and (won := row.uncertainty["auc"].vs_hold) is not None:
+        if (sure := row.certainty("auc")) and (won := sure.vs_hold) is not None:
             best[run_of(row)] = max(best.get(run_of(row), -1), won.value)
     if not best:
         return None
@@ -293,7 +304,7 @@ def _gains(view: View, rows: Sequence[SummaryRow], runs: Sequence[str]) -> Figur
         style = {**styles[forecaster], "linestyle": "", "label": _short(forecaster)}
         aside = 0.7 * ((rivals.index(forecaster) + 0.5) / len(rivals) - 0.5)
         for row in rows:
-            uncertainty = row.uncertainty.get("auc") if row.forecaster == forecaster else None
+            uncertainty = row.certainty("auc") if row.forecaster == forecaster else None
             if uncertainty is None or uncertainty.vs_hold is None:
                 continue
             y = runs.index(run_of(row)) + aside

@@ -43,7 +43,7 @@ from lae_sim.report.table import (
     text_of,
     write_csv,
 )
-from lae_sim.study.records import MEAN, Comparison, Requirement
+from lae_sim.study.records import MEAN, Comparison, Requirement, SummaryRow
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
@@ -82,9 +82,11 @@ _COUNT, _MS, _RATIO, _RECOVERED = (
 _RANKING = (
     Column("n", "sequences", _COUNT, "number of sequences"),
     Column("AUC", "auc", SCORE, "with its 95 % interval over sequences"),
+    Column("modelled", "modelled_auc", SCORE, "AUC under the search model, with its interval"),
+    Column("ranked by", "ranked_by", meaning="whose AUC is ranked, compared and tested"),
     Column("jitter", _jitter, meaning="the range of 95 % of the repetitions' AUC"),
     Column("offline", "offline_auc", SCORE, "AUC without latency"),
-    Column("change", lambda row: relative_change(row["auc"], row["offline_auc"]), CHANGE,
+    Column("change", lambda row: relative_change(row["ranked_auc"], row["offline_auc"]), CHANGE,
            "of the AUC, to offline"),
     Column("recovered", "recovered_auc", _RECOVERED,
            "share of the AUC lost to latency that the forecaster wins back"),
@@ -92,6 +94,8 @@ _RANKING = (
     Column("p", "vs_hold_auc_p", p_label, "of no difference to hold: Wilcoxon's signed-rank test "
            "over sequences, not corrected"),
     Column("DP", "dp20", SCORE, "precision at 20 px"),
+    Column("modelled DP", "modelled_dp20", SCORE, "under the search model"),
+    Column("lost", "lost_share", PERCENT, "share of the outputs answered while the target is lost"),
     Column("offline DP", "offline_dp20", SCORE, "without latency"),
     Column("ms/call", "elapsed_ms", _MS, "mean processing time"),
     Column("init ms", "init_ms", _MS, "mean time of an initialisation; the notes say where from"),
@@ -109,9 +113,9 @@ _RANKING = (
            meaning="the share of outputs that follow another frame than when recorded"),
     Column("engine", "engine", meaning="batch, or simpy where policy or latency need it"),
 )  # fmt: skip
-_PAPER = ("AUC", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")
-_TERMINAL = ("n", "AUC", "jitter", "offline", "recovered", "vs hold", "p", "DP", "ms/call",
-             "init ms", "skipped", "age ms", "front")  # fmt: skip
+_PAPER = ("AUC", "modelled", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")
+_TERMINAL = ("n", "AUC", "modelled", "ranked by", "jitter", "offline", "recovered", "vs hold", "p",
+             "DP", "ms/call", "init ms", "skipped", "age ms", "front")  # fmt: skip
 
 
 def ranking(
@@ -128,18 +132,35 @@ def ranking(
     places = [(row.dataset, *(getattr(row, key) for key in settings)) for row in view.rows]
     order = {place: i for i, place in reversed([*enumerate(places)])}
     best_first = sorted(
-        zip(places, view.rows), key=lambda pair: (order[pair[0]], -(pair[1].scores["auc"] or 0))
+        zip(places, view.rows), key=lambda pair: (order[pair[0]], -(pair[1].score("auc") or 0))
     )
     shown = [row for _, row in best_first if view.stands(row) or not standing_alone]
-    rows = [{**row.flat(), "tracker": view.names[run_of(row)]} for row in shown]
-    repeated = any("auc_jitter_low" in row for row in rows)
+    rows = [{**_as_ranked(row), "tracker": view.names[run_of(row)]} for row in shown]
+    left_out = set() if any("auc_jitter_low" in row for row in rows) else {"jitter"}
+    if not any(row.modelled for row in shown):
+        left_out |= {"modelled", "modelled DP", "lost"}
+    if len({row.ranked_by for row in shown}) == 1:
+        left_out.add("ranked by")
     columns = [
         *_names(["tracker", "forecaster", "dataset", *(() if standing_alone else settings)]),
         *(column for column in _RANKING if (titles is None or column.title in titles)
-          and (repeated or column.title != "jitter")),
+          and column.title not in left_out),
     ]  # fmt: skip
     first = "The best AUC first" if standing_alone else "The best AUC of each setting first"
-    return Table.of(columns, rows, "ranking", f"{first}: {shared_setting(shown)}")
+    table = Table.of(columns, rows, "ranking", f"{first}: {shared_setting(shown)}")
+    return replace(table, note="; ".join(view.results.ranked_by()))
+
+
+def _as_ranked(row: SummaryRow) -> dict[str, Any]:
+    """A row whose differences, shares and jitter are of the AUC that is ranked."""
+    flat: dict[str, Any] = row.flat()
+    if row.ranked_by == "modelled":
+        for key in [key for key in flat if "_modelled_auc" in key]:
+            flat[key.replace("_modelled_auc", "_auc")] = flat[key]
+        for end in ("low", "high"):
+            if f"modelled_auc_jitter_{end}" in flat:
+                flat[f"auc_jitter_{end}"] = flat[f"modelled_auc_jitter_{end}"]
+    return {**flat, "ranked_auc": row.score("auc")}
 
 
 def table2(view: View) -> Table:
@@ -161,7 +182,7 @@ def table2(view: View) -> Table:
             tracker, forecaster = record
             offline = forecaster == "offline"
             row = by_name.get((tracker, dataset, "hold" if offline else forecaster))
-            return None if row is None else (row.offline if offline else row.scores).get(metric)
+            return None if row is None else row.offline[metric] if offline else row.score(metric)
 
         def change(record: tuple[str, str]) -> float | None:
             tracker, forecaster = record
@@ -266,8 +287,12 @@ def comparison_table(view: View) -> Table:
         Column("a better here", "better_here", _RATIO),
         Column("a better", "better", _RATIO),
     ]
+    if len({row.ranked_by for row in rows}) > 1:
+        columns.append(Column("ranked by", "ranked_by"))
     named = [{**row.flat(), "a": view.names[row.a], "b": view.names[row.b]} for row in rows]
-    table = Table.of(columns, named, "comparisons", f"Trackers against each other{left_out}")
+    whose = ", by the modelled AUC" if {row.ranked_by for row in rows} == {"modelled"} else ""
+    caption = f"Trackers against each other{whose}{left_out}"
+    table = Table.of(columns, named, "comparisons", caption)
     note = (
         "a better here: probability that one run of a beats one of b on these sequences; "
         "a better: on others like them. p: Wilcoxon's signed-rank test; Holm: corrected for the "
@@ -283,7 +308,7 @@ def required_table(view: View, mark_ends: bool = False) -> Table:
     """
     rows = view.results.required
     columns = [
-        *_names(["trace", *_differing(rows, ("policy", "fps", "latency", "convention"))]),
+        *_names(["trace", *_differing(rows, [key for key in SETTINGS if key != "scale"])]),
         *_names(["forecaster"]),
         Column("AUC asked", "required_auc", Number(".3g")),
         Column("without latency", "auc_without_latency", SCORE),
@@ -294,6 +319,8 @@ def required_table(view: View, mark_ends: bool = False) -> Table:
         Column("world fps at most", "fps_at_most", _MS,
                "unknown where a cost or a policy has a time of its own"),
     ]  # fmt: skip
+    if any(row.ranked_by == "modelled" for row in rows):
+        columns.append(Column("AUC is", "ranked_by", meaning="as the ranking has it"))
     return Table.of(
         columns,
         [{**row.flat(), "trace": run_of(row)} for row in rows],
@@ -370,7 +397,7 @@ def study_text(results: StudyResults | View) -> str:
         tables.append(required_table(view, mark_ends=True))
     parts = []
     for table in tables:
-        text = text_of(table, intervals=("AUC", "jitter", "AUC of a - b"))
+        text = text_of(table, intervals=("AUC", "modelled", "jitter", "AUC of a - b"))
         text = text.replace("★", "*")  # not every terminal has stars
         parts.append("\n".join([table.caption, text, legend_of(table)]))
     lines = [f"{len(results.plan.cells)} cells, {results.computed} of them computed now"]

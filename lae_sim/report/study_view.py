@@ -15,9 +15,10 @@ import numpy as np
 
 from lae_sim.comparison.statistics import by_attribute
 from lae_sim.errors import LaeError, shown
+from lae_sim.evaluation.modelled import Ranking
 from lae_sim.report.table import printable
 from lae_sim.study.records import MEAN, Comparison, Requirement, SummaryRow
-from lae_sim.study.summary import Scores
+from lae_sim.study.summary import Scores, ranked, rankings_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
 
 
-SETTINGS = ("policy", "fps", "latency", "scale", "convention")
+SETTINGS = ("policy", "fps", "latency", "scale", "search", "pre_forecaster", "convention")
 """What says how a trace is replayed and scored, but for where its times come from."""
 
 
@@ -78,8 +79,15 @@ class View:
     def row_of(self, scores: Scores) -> SummaryRow:
         """The row of the summary that has the means of scores at the first sigma."""
         setting = scores.setting
-        values = setting.policy, setting.fps, setting.latency, setting.world.scale
-        return self._first[setting.run, (*values, scores.convention), scores.forecaster]
+        world = setting.policy, setting.fps, setting.latency, setting.world.scale
+        searched = setting.world.search, setting.pre_forecaster
+        values = (*world, *searched, scores.convention)
+        return self._first[setting.run, values, scores.forecaster]
+
+    @cached_property
+    def rankings(self) -> dict[tuple[str, ...], Ranking]:
+        """By what the scores of each group are ranked and compared."""
+        return rankings_of(self.results.scores)
 
     @cached_property
     def chosen(self) -> dict[str, tuple[str | Fraction, ...]]:
@@ -148,7 +156,7 @@ class View:
     def _tidy(self, scores: Scores) -> Iterable[dict[str, str | float]]:
         """The AUC of each sequence, as :mod:`lae_sim.comparison.statistics` wants it."""
         row = self.row_of(scores)
-        aucs = {row.forecaster: scores.means["auc"][:, 0]}
+        aucs = {row.forecaster: ranked(scores.means, self.rankings[scores.group])[:, 0]}
         if row.forecaster == "hold":
             aucs["offline"] = scores.once["offline_auc"]
         for forecaster, values in aucs.items():
@@ -169,9 +177,11 @@ class View:
 def shared_setting(rows: Sequence[SummaryRow], but: str = "") -> str:
     """What some rows have in common, in words; one key may be left out."""
     parts = []
-    labels = ("policy", "world", "latency", "times x", "convention")
+    labels = ("policy", "world", "latency", "times x", "search", "pre-forecaster", "convention")
     for name, label in zip(SETTINGS, labels):
         values = {str(getattr(row, name)) for row in rows}
+        if values in ({"off"}, {"none"}):
+            continue
         value = (
             values.pop() if len(values) == 1 else "of each trace" if name == "fps" else "various"
         )
@@ -179,7 +189,11 @@ def shared_setting(rows: Sequence[SummaryRow], but: str = "") -> str:
         parts += [f"{label} {value}{unit}"] if name != but else []
     sigma = rows[0].sigma
     text = "mean over sigma = 0, 0.02, ..., 1" if sigma == MEAN else f"sigma {sigma}"
-    return ", ".join(parts if but == "sigma" else [*parts, text])
+    ranked_by = {row.ranked_by for row in rows}
+    parts += [] if but == "sigma" else [text]
+    if "modelled" in ranked_by:
+        parts.append("modelled scores" if len(ranked_by) == 1 else "modelled scores, and recorded")
+    return ", ".join(parts)
 
 
 def several(rows: Sequence[SummaryRow]) -> list[str]:

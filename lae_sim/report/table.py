@@ -290,6 +290,10 @@ METRIC_LABELS = {
     "norm_auc": "norm. AUC",
     "mauc": "mAUC",
     "mdp20": "mDP@20",
+    "modelled_auc": "modelled AUC",
+    "modelled_dp20": "modelled DP@20",
+    "modelled_mauc": "modelled mAUC",
+    "modelled_mdp20": "modelled mDP@20",
 }
 
 

@@ -16,23 +16,27 @@ from typing import Any
 import numpy as np
 
 from lae_sim import __version__
+from lae_sim._arrays import Floats
 from lae_sim.engine.lanes import batchable
 from lae_sim.evaluation.caveats import notes_on
 from lae_sim.evaluation.evaluate import ReplayStatistics, evaluate_groups
 from lae_sim.evaluation.metrics import find_convention
-from lae_sim.evaluation.totals import CurveTotals
+from lae_sim.evaluation.modelled import MODELLED, over_sigmas
+from lae_sim.evaluation.totals import CurveTotals, ModelledTotals
 from lae_sim.files import text_digest
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes
+from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import RandomSource
 from lae_sim.replay.run import Run, replay_repeated
+from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import World, kind_of, label_of
 from lae_sim.study.rows import CellRows
 from lae_sim.study.spec import is_random
 from lae_sim.trace.file import Trace, held, read_trace
 from lae_sim.trace.metadata import Metadata
 
-VERSION = 3
+VERSION = 4
 """Of the cells' files; another version is another cell."""
 
 GROUP = 1 << 17
@@ -63,6 +67,7 @@ class Setting:
     Attributes:
         trace: the boxes and the truth.
         timing: another device's trace that the times come from; the world names it too.
+        passes: strided and gap passes; the world names them too.
         world: how the trace is replayed, of random times with their seed; conventions, forecasters
             and costs are the cells'.
         code: of a user's own policy or latency, a digest of its file.
@@ -72,6 +77,7 @@ class Setting:
 
     trace: Input
     timing: Input | None
+    passes: tuple[Input, ...]
     world: World
     code: str
     first: int
@@ -102,6 +108,17 @@ class Setting:
         kind, (_, comma, init) = kind_of(latency), latency.partition(",")
         return f"{kind}{comma}{init}" if is_random(latency) else latency
 
+    @property
+    def pre_forecaster(self) -> str:
+        """What says where the tracker searches, as tables name it."""
+        name = self.world.pre_forecaster or "none"
+        return f"{name}, size kept" if self.world.keep_size else name
+
+    @property
+    def inputs(self) -> list[Input]:
+        """All files that are read."""
+        return [self.trace, *([] if self.timing is None else [self.timing]), *self.passes]
+
     def columns(self) -> dict[str, str]:
         """What names the replay in tables."""
         return {
@@ -111,6 +128,8 @@ class Setting:
             "fps": str(self.fps),
             "latency": self.latency,
             "scale": str(self.world.scale),
+            "search": self.world.search,
+            "pre_forecaster": self.pre_forecaster,
         }
 
     def document(self) -> dict[str, Any]:
@@ -119,6 +138,7 @@ class Setting:
             **self.columns(),
             "trace": [self.trace.label, self.trace.digest],
             "timing": self.timing and [self.timing.label, self.timing.digest],
+            "passes": [[each.label, each.digest] for each in self.passes],
             "code": self.code,
             "latency": label_of(self.world.latency),
             "first": self.first,
@@ -192,7 +212,7 @@ class Result:
         key: the cell's.
         rows: a Parquet file (see :mod:`lae_sim.study.rows`).
         about: curves at the first sigma, how many outputs are approximate, the engine, where times
-            of initialisations are from, notes.
+            of initialisations are from, notes, what is modelled (see :func:`_modelled`).
     """
 
     key: str
@@ -232,7 +252,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
             repetitions.append(repetition)
             yield run
 
-    curves, kept = CurveTotals(), []
+    curves, modelled, kept = CurveTotals(), ModelledTotals(0), []
     departures = calls = 0
     for part in evaluate_groups(
         runs(), trace.metadata, chosen, world.sigmas, convention, costs=costs, frames=GROUP
@@ -242,6 +262,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
         for f, writer in enumerate(writers):
             writer.add(part, f, of_part)
         curves.add(part)
+        modelled.add(part)
         departures += int(part.replay.departures.sum())
         calls += int((part.replay.processed - 1).sum())
         kept.append(part.replay.chosen(np.flatnonzero(of_part == setting.first)))
@@ -256,6 +277,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
             "approximate_outputs": departures,
             "calls": calls,
             "init_source": world.init_source(replay.times),
+            "modelled": _modelled(modelled, f, replay.search),
             "notes": [
                 *notes_on(about, trace.metadata, convention, only),
                 *cost_notes({cell.forecaster: cell.cost_ns} if cell.cost_ns else {}),
@@ -277,6 +299,32 @@ def _curves(totals: CurveTotals, f: int) -> dict[str, list[float] | None]:
     return {name: None if np.isnan(c[0]) else c.tolist() for name, c in named.items()}
 
 
+def _modelled(totals: ModelledTotals, f: int, search: SearchModel | None) -> dict[str, Any] | None:
+    """Of a forecaster's modelled scores what its rows do not say; None where nothing is modelled.
+
+    That is whether the reach is known, from where, and the joint draws (see
+    :class:`lae_sim.evaluation.modelled.ModelledScores`) of the scores at the first sigma, and of
+    their means over sigma: sums over the sequences and repetitions, and how many count.
+    """
+    if search is None or totals.known is None:
+        return None
+    draws = {metric: totals.draws(metric)[:, f] for metric in MODELLED}  # [2, J, M]
+    return {
+        "known": totals.known,
+        "source": search.source,
+        "unexplained": dict(totals.unexplained),
+        "first": {metric: _distinct(each[..., 0]) for metric, each in draws.items()},
+        "mean": {metric: _distinct(over_sigmas(each)[..., 0]) for metric, each in draws.items()},
+    }
+
+
+def _distinct(draws: Floats) -> list[list[float]]:
+    """Draws, or one of them where they are all the same."""
+    same = bool((draws == draws[:, :1]).all())
+    kept: list[list[float]] = (draws[:, :1] if same else draws).tolist()
+    return kept
+
+
 @dataclass(frozen=True)
 class Replayed:
     """The runs of a setting.
@@ -285,11 +333,13 @@ class Replayed:
         runs: repetition and run, as they are made.
         engine: ``"batch"``, or ``"simpy"`` where the policy or the source of times knows no lanes.
         times: metadata of the trace that the times are from.
+        search: the model of where the tracker finds its target; None if there is none.
     """
 
     runs: Iterable[tuple[int, Run]]
     engine: str
     times: Metadata
+    search: SearchModel | None
 
 
 def replayed(setting: Setting, trace: Trace) -> Replayed:
@@ -299,10 +349,12 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
         setting: which trace, and how.
         trace: the setting's, as it was read.
     """
-    runs = setting.world.replay(trace, batch=True)
+    name = setting.world.pre_forecaster
+    searches = None if name is None else load_forecaster(name)
+    runs = setting.world.replay(trace, batch=True, pre_forecaster=searches)
     times = runs.source(next(iter(runs.times)))
     engine = "batch" if batchable([times], runs.policy) else "simpy"
     if isinstance(runs.source, RandomSource):
         repeated = replay_repeated(runs, setting.count, setting.first)
-        return Replayed(repeated, engine, runs.times.metadata)
-    return Replayed(((0, run) for run in runs), engine, runs.times.metadata)
+        return Replayed(repeated, engine, runs.times.metadata, runs.search)
+    return Replayed(((0, run) for run in runs), engine, runs.times.metadata, runs.search)

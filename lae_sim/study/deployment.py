@@ -11,6 +11,7 @@ import numpy as np
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate_groups
 from lae_sim.evaluation.metrics import find_convention
+from lae_sim.evaluation.modelled import Ranking
 from lae_sim.files import text_digest
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.study.cells import Cell, replayed
@@ -72,6 +73,7 @@ class Slowest:
         auc: the mean AUC there.
         beyond: the hundredth after it, as text; None if the largest that is tried is enough.
         beyond_auc: the mean AUC there.
+        modelled: whether these are modelled: wherever a replay is not exact, its reach is known.
     """
 
     auc_without_latency: float
@@ -79,6 +81,7 @@ class Slowest:
     auc: float | None = None
     beyond: str | None = None
     beyond_auc: float | None = None
+    modelled: bool = False
 
 
 def slowest(search: Search) -> Slowest:
@@ -88,32 +91,40 @@ def slowest(search: Search) -> Slowest:
     both replayed, so that what is said of these two is exact.
     """
     known: dict[int, float] = {}
+    modelled = False
     setting = search.cell.setting
     trace = held(read_trace(setting.trace.path, setting.sequences or None), HELD)
 
     def enough(step: int) -> bool:
+        nonlocal modelled
         if step not in known:
-            known[step] = mean_auc(search, step * STEP, trace)
+            known[step], by_model = mean_auc(search, step * STEP, trace)
+            modelled = modelled or by_model
         return known[step] >= search.required
 
     if not enough(0):
-        return Slowest(known[0], beyond="0", beyond_auc=known[0])
+        return Slowest(known[0], beyond="0", beyond_auc=known[0], modelled=modelled)
     low, high = 0, 1
     while enough(high) and high < MOST:
         low, high = high, 2 * high
     if enough(high):
-        return Slowest(known[0], str(high * STEP), known[high])
+        return Slowest(known[0], str(high * STEP), known[high], modelled=modelled)
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if enough(middle) else (low, middle)
-    return Slowest(known[0], str(low * STEP), known[low], str(high * STEP), known[high])
+    ends = str(low * STEP), known[low], str(high * STEP), known[high]
+    return Slowest(known[0], *ends, modelled=modelled)
 
 
-def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
-    """The mean AUC over sequences and repetitions at a scale of all times."""
+def mean_auc(search: Search, scale: Fraction, trace: Trace) -> tuple[float, bool]:
+    """The mean AUC over sequences and repetitions at a scale of all times.
+
+    It is the one by which the replay would be ranked (:class:`.modelled.Ranking`), and whether that
+    is the modelled one.
+    """
     cell = search.cell
     setting = replace(cell.setting, world=replace(cell.setting.world, scale=scale))
-    parts = evaluate_groups(
+    groups = evaluate_groups(
         (run for _, run in replayed(setting, trace).runs),
         trace.metadata,
         {cell.forecaster: search.factory},
@@ -121,10 +132,16 @@ def mean_auc(search: Search, scale: Fraction, trace: Trace) -> float:
         find_convention(cell.convention),
         costs={cell.forecaster: cell.cost_ns},
     )
-    scores = np.concatenate([part.scores["auc"][0, :, 0] for part in parts])
+    parts = list(groups)
+    modelled = Ranking.of(
+        (part.modelled.known, not part.replay.departures.any()) for part in parts
+    ).modelled
+    scores = np.concatenate(
+        [(part.modelled.mean if modelled else part.scores)["auc"][0, :, 0] for part in parts]
+    )
     if np.isnan(scores).all():
         raise LaeError("no sequence counts in the mean AUC: its truth is nowhere valid")
-    return float(np.nanmean(scores))
+    return float(np.nanmean(scores)), modelled
 
 
 def requirement(search: Search, answer: Slowest) -> Requirement:
@@ -143,6 +160,8 @@ def requirement(search: Search, answer: Slowest) -> Requirement:
         policy=setting.policy,
         fps=setting.fps,
         latency=setting.latency,
+        search=setting.world.search,
+        pre_forecaster=setting.pre_forecaster,
         convention=search.cell.convention,
         forecaster=search.cell.forecaster,
         sigma=setting.world.sigmas[0],
@@ -154,4 +173,5 @@ def requirement(search: Search, answer: Slowest) -> Requirement:
         auc_without_latency=answer.auc_without_latency,
         speed_up=None if not scale else float(1 / scale),
         fps_at_most=float(scale * setting.fps) if scale is not None and relative else None,
+        ranked_by="modelled" if answer.modelled else "recorded",
     )

@@ -14,8 +14,9 @@ from lae_sim.files import labels, text_digest
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import resolve_costs
 from lae_sim.learning.folds import Trainer
-from lae_sim.learning.registry import load_any
-from lae_sim.replay.world import World
+from lae_sim.learning.registry import load_any, load_forecaster
+from lae_sim.replay.reach import passes_for
+from lae_sim.replay.world import World, named
 from lae_sim.study.cells import Cell, Input, Setting, Task
 from lae_sim.study.spec import Study, is_random
 from lae_sim.trace.file import read_trace
@@ -47,7 +48,7 @@ class Plan:
 
     Attributes:
         study: what was asked for.
-        sources: its traces, and those of other devices' times.
+        sources: its traces, those of other devices' times, and passes.
         cells: in the order of the tables.
         forecasters: factories by name, and trainers of those that must be trained.
         training: digest of all that the training depends on.
@@ -77,7 +78,11 @@ class Plan:
         read = {each.label: read_trace(each.path, wanted) for each in own}
         fixed = [name for name in study.times if not is_random(name)] or ["recorded"]
         worlds = World.sweep(
-            policy=study.policies[0], fps=study.fps[0], latency=fixed, scale=study.scales
+            policy=study.policies[0],
+            fps=study.fps[0],
+            latency=fixed,
+            scale=study.scales,
+            search="off",
         )
         return fitted(read, self.forecasters, worlds, study.folds, study.seed, progress)
 
@@ -92,8 +97,10 @@ def make_plan(study: Study, base: Path | None = None) -> Plan:
     Raises:
         LaeError: if a trace is missing or damaged, or there is no such forecaster.
     """
-    own, timed = find_traces(study.traces, base), find_traces(study.timing, base)
-    paths = list(dict.fromkeys([*own, *timed]))
+    own, timed, passed = (
+        find_traces(each, base) for each in (study.traces, study.timing, study.passes)
+    )
+    paths = list(dict.fromkeys([*own, *timed, *passed]))
     sources = {}
     for path, label in zip(paths, labels([path.removesuffix(".parquet") for path in paths])):
         trace = read_trace(path)
@@ -107,15 +114,18 @@ def make_plan(study: Study, base: Path | None = None) -> Plan:
                 f"timing: {other.input.path} is of {metadata.tracker} on {metadata.dataset}: none "
                 "of the traces is of the same tracker and dataset on another device"
             )
+    passes = passes_for(traces, [sources[path] for path in passed])
     names = dict.fromkeys(["hold", *study.forecasters])
     forecasters = {name: load_any(name) for name in names}
     training = _training(study, traces)
     codes = {name: _code(name, each, training) for name, each in forecasters.items()}
+    for name in filter(None, study.pre_forecaster):
+        named("pre_forecaster", load_forecaster, name)
     costs = resolve_costs(study.costs, dict.fromkeys(names, Hold), ())  # none is measured
     cells = [
         Cell(setting, name, codes[name], costs.get(name, 0), convention)
-        for source in traces
-        for setting in _settings(study, source, timing)
+        for source, own_passes in zip(traces, passes)
+        for setting in _settings(study, source, timing, own_passes)
         for convention in study.conventions
         for name in forecasters
     ]
@@ -133,15 +143,24 @@ def tasks(cells: Iterable[Cell], factories: Mapping[str, AnyFactory]) -> list[Ta
     ]
 
 
-def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Setting]:
+def _settings(
+    study: Study, source: Source, timing: Sequence[Source], passes: Sequence[Source]
+) -> list[Setting]:
     """All ways in which a trace is replayed."""
     other_times = [other.input for other in timing if _same_runs(source, other)]
     codes = {name: _own_code(name) for name in (*study.policies, *study.times)}
+    searching = {name: "" if name is None else _file_code(name) for name in study.pre_forecaster}
     rates = dict.fromkeys(source.metadata.fps if fps is None else fps for fps in study.fps)
     found = []
     chunk = max(1, CHUNK_FRAMES // (max(source.frames, 1) * max(1, len(study.sigmas) // 8)))
-    for times, policy, fps, latency, scale in product(
-        [None, *other_times], study.policies, rates, study.times, study.scales
+    for times, policy, fps, latency, scale, search, pre_forecaster in product(
+        [None, *other_times],
+        study.policies,
+        rates,
+        study.times,
+        study.scales,
+        study.search,
+        study.pre_forecaster,
     ):
         world = World(
             fps=fps,
@@ -149,13 +168,18 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
             latency=study.seeded(latency),
             scale=scale,
             timing=None if times is None else times.path,
+            passes=tuple(each.input.path for each in passes),
+            search=search,
+            pre_forecaster=pre_forecaster,
+            keep_size=study.keep_size and pre_forecaster is not None,
             sigmas=study.sigmas,
         )
         setting = Setting(
             trace=source.input,
             timing=times,
+            passes=tuple(each.input for each in passes),
             world=world,
-            code=codes[policy] + codes[latency],
+            code=codes[policy] + codes[latency] + searching[pre_forecaster],
             first=0,
             count=1,
             sequences=tuple(sorted(study.sequences)),
@@ -170,9 +194,7 @@ def _settings(study: Study, source: Source, timing: Sequence[Source]) -> list[Se
 
 def _same_runs(source: Source, other: Source) -> bool:
     """Whether two traces are of one tracker on one dataset, on different devices."""
-    one, another = source.metadata, other.metadata
-    same = (one.tracker, one.dataset) == (another.tracker, another.dataset)
-    return same and source.input.path != other.input.path
+    return source.metadata.goes_with(other.metadata) and source.input.path != other.input.path
 
 
 def _training(study: Study, traces: Sequence[Source]) -> str:
@@ -185,10 +207,13 @@ def _training(study: Study, traces: Sequence[Source]) -> str:
 
 def _code(name: str, forecaster: AnyFactory | Trainer, training: str) -> str:
     """What else a forecaster's figures depend on: its file, its code, its training."""
+    return (training if isinstance(forecaster, Trainer) else "") + _file_code(name)
+
+
+def _file_code(name: str) -> str:
+    """Digest of the file that a forecaster's name names, of weights or of code; or empty."""
     kind, _, value = name.partition(":")
-    if kind == "learned" and value:
-        return digest(value)
-    return (training if isinstance(forecaster, Trainer) else "") + _own_code(name)
+    return digest(value) if kind == "learned" and value else _own_code(name)
 
 
 def _own_code(name: str) -> str:

@@ -52,7 +52,8 @@ class Uncertainty:
 
     def columns(self, metric: str) -> dict[str, Plain]:
         """Values by their keys in a flat row."""
-        row = self.interval.columns(metric)
+        is_modelled = metric.startswith("modelled_")  # whose own interval is the model's
+        row = self.interval.columns(f"{metric}_bootstrap" if is_modelled else metric)
         if self.jitter is not None:
             row |= self.jitter.columns(f"{metric}_jitter")
         if self.vs_hold is not None:
@@ -95,13 +96,40 @@ class Staleness:
 
 
 @dataclass(frozen=True)
+class Modelled:
+    """Mean scores under the search model.
+
+    Attributes:
+        known: whether the reach is known (see :class:`lae_sim.evaluation.modelled.ModelledScores`).
+        lost_share: share of the outputs answered while the target is lost.
+        scores: mean AUC and DP in 0..1; None if unknown.
+        intervals: of these, as far as reach, phases and what is unexplained go; in the rows of the
+            first sigma and of the mean over the grid.
+    """
+
+    known: bool
+    lost_share: float
+    scores: Mapping[str, float | None]
+    intervals: Mapping[str, Interval] = field(default_factory=dict)
+
+    def columns(self) -> dict[str, Plain]:
+        """Values by their keys in a flat row."""
+        row: dict[str, Plain] = {"c_known": self.known, "lost_share": self.lost_share}
+        for metric, score in self.scores.items():
+            row[f"modelled_{metric}"] = score
+            if metric in self.intervals:
+                row |= self.intervals[metric].columns(f"modelled_{metric}")
+        return row
+
+
+@dataclass(frozen=True)
 class SummaryRow(Record):
     """The means of one trace, setting, convention, forecaster and sigma.
 
     Attributes:
         trace, tracker, dataset, device: of the boxes.
         times_from: the trace that the times come from.
-        policy, fps, latency, scale: how it was replayed.
+        policy, fps, latency, scale, search, pre_forecaster: how it was replayed.
         convention, forecaster: names.
         sequences, repetitions: how many.
         engine: ``"batch"`` or ``"simpy"``.
@@ -113,8 +141,12 @@ class SummaryRow(Record):
         skip_rate: share of frames never processed.
         sigma: permitted latency, frames, or ``MEAN`` over the grid of them.
         scores, offline: mean of each metric in 0..1, under and without latency; None if unknown.
-        uncertainty: of AUC and DP, in the rows of the first sigma and of the mean over the grid.
+        uncertainty: of AUC and DP, in the rows of the first sigma and of the mean over the grid;
+            where the reach is known of ``modelled_auc`` and ``modelled_dp20`` too.
         staleness: of each sigma; None of their mean.
+        modelled: scores under the search model; None where it says nothing.
+        ranked_by: ``"modelled"`` or ``"recorded"`` (see
+            :class:`lae_sim.evaluation.modelled.Ranking`).
         pareto: whether no other trace is both faster and better.
     """
 
@@ -127,6 +159,8 @@ class SummaryRow(Record):
     fps: Fraction
     latency: str
     scale: Fraction
+    search: str
+    pre_forecaster: str
     convention: str
     forecaster: str
     sequences: int
@@ -143,7 +177,20 @@ class SummaryRow(Record):
     offline: Mapping[str, float | None]
     uncertainty: Mapping[str, Uncertainty] = field(default_factory=dict)
     staleness: Staleness | None = None
+    modelled: Modelled | None = None
+    ranked_by: str = "recorded"
     pareto: bool = False
+
+    def score(self, metric: str) -> float | None:
+        """Mean AUC or DP as it is ranked: modelled, or of the recorded boxes."""
+        if self.ranked_by == "modelled" and self.modelled is not None:
+            return self.modelled.scores[metric]
+        return self.scores[metric]
+
+    def certainty(self, metric: str) -> Uncertainty | None:
+        """How sure that is."""
+        ranked = f"modelled_{metric}" if self.ranked_by == "modelled" else metric
+        return self.uncertainty.get(ranked, self.uncertainty.get(metric))
 
     def flat(self) -> dict[str, Plain]:
         """The flat row of JSON and CSV: unknown values are None, what is not asked has no key."""
@@ -153,7 +200,9 @@ class SummaryRow(Record):
             row |= uncertainty.columns(metric)
         if self.staleness is not None:
             row |= self.staleness.columns()
-        return {**row, "pareto": self.pareto}
+        if self.modelled is not None:
+            row |= self.modelled.columns()
+        return {**row, "ranked_by": self.ranked_by, "pareto": self.pareto}
 
 
 @dataclass(frozen=True)
@@ -161,7 +210,8 @@ class Comparison(Record):
     """Two traces of one dataset against each other, in one setting, with one forecaster.
 
     Attributes:
-        dataset, policy, fps, latency, scale, convention, forecaster, sigma: what they share.
+        dataset, policy, fps, latency, scale, search, pre_forecaster, convention, forecaster, sigma:
+            what they share.
         a, b: the traces, with that of their times, if from another.
         sequences: how many both have a score of.
         difference: of the mean AUC, a - b, paired over the sequences.
@@ -169,6 +219,7 @@ class Comparison(Record):
             counts half); None without jitter.
         better: the same on other sequences like these.
         p_holm: p of the difference, corrected for the number of pairs of its group.
+        ranked_by: whose AUC it is, ``"modelled"`` or ``"recorded"``.
     """
 
     dataset: str
@@ -176,6 +227,8 @@ class Comparison(Record):
     fps: Fraction
     latency: str
     scale: Fraction
+    search: str
+    pre_forecaster: str
     convention: str
     forecaster: str
     sigma: Fraction | str
@@ -186,6 +239,7 @@ class Comparison(Record):
     better_here: float | None
     better: float
     p_holm: float = 1.0
+    ranked_by: str = "recorded"
 
     def flat(self) -> dict[str, Plain]:
         """The flat row of JSON and CSV."""
@@ -197,6 +251,7 @@ class Comparison(Record):
             "better_here": self.better_here,
             "better": self.better,
             "p_holm": self.p_holm,
+            "ranked_by": self.ranked_by,
         }
 
 
@@ -205,7 +260,8 @@ class Requirement(Record):
     """What a required AUC asks of a device and of the world.
 
     Attributes:
-        trace, times_from, policy, fps, latency, convention, forecaster, sigma: where it is asked.
+        trace, times_from, policy, fps, latency, search, pre_forecaster, convention, forecaster,
+            sigma: where it is asked.
         required_auc: the mean AUC.
         scale: the largest scale of all times at which it is reached, in hundredths; None if it is
             not even without latency.
@@ -216,6 +272,7 @@ class Requirement(Record):
         speed_up: how much faster the device must be, 1 / scale; None without a scale above 0.
         fps_at_most: how fast the world may move, with the recorded motion from frame to frame;
             None where a cost or a policy has a time of its own.
+        ranked_by: whose AUC it is, ``"modelled"`` or ``"recorded"``.
     """
 
     trace: str
@@ -223,6 +280,8 @@ class Requirement(Record):
     policy: str
     fps: Fraction
     latency: str
+    search: str
+    pre_forecaster: str
     convention: str
     forecaster: str
     sigma: Fraction
@@ -234,6 +293,7 @@ class Requirement(Record):
     auc_without_latency: float
     speed_up: float | None
     fps_at_most: float | None
+    ranked_by: str = "recorded"
 
 
 @dataclass(frozen=True)

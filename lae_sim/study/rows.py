@@ -11,10 +11,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lae_sim._arrays import Floats
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import METRICS
+from lae_sim.evaluation.modelled import MODELLED
 from lae_sim.trace.columns import from_numpy, from_texts
+
+_ENDS = ("", "_low", "_high")
 
 COLUMNS = {
     "trace": "string",
@@ -25,6 +29,8 @@ COLUMNS = {
     "fps": "string",
     "latency": "string",
     "scale": "string",
+    "search": "string",
+    "pre_forecaster": "string",
     "convention": "string",
     "forecaster": "string",
     "sequence": "string",
@@ -41,13 +47,17 @@ COLUMNS = {
     "failure_frame": "int32",
     **dict.fromkeys(METRICS, "float64"),
     **{f"offline_{metric}": "float64" for metric in METRICS},
+    **{f"modelled_{metric}{end}": "float64" for metric in MODELLED for end in _ENDS},
+    "lost_share": "float64",
 }
 """Columns of the results, and their types.
 
 ``elapsed_ms`` is the mean time of the calls but the initialisation, ``init_ms`` the latter's;
 ``longest_hold`` and the mismatches are in frames, ``failure_frame`` is the first whose answer does
 not overlap the truth (``world_frames`` if there is none); scores are in 0..1, NaN where the
-sequence leaves the mean or, offline, where the trace lacks boxes.
+sequence leaves the mean or, offline, where the trace lacks boxes. The modelled ones are those under
+the search model, with the ends of their intervals, and ``lost_share`` is the share of the outputs
+answered while the target is lost: NaN where the replay is exact, or the model off.
 """
 
 
@@ -82,6 +92,7 @@ class CellRows:
             "elapsed_ms": replay.calls_ns / calls / 1e6,
             "init_ms": replay.init_ns / 1e6,
             **{f"offline_{metric}": part.offline[metric] for metric in METRICS},
+            "lost_share": np.where(part.modelled.applies, part.modelled.lost_share, np.nan),
         }
         values = {name: np.repeat(column, count) for name, column in once.items()}
         values |= {  # by sequence and sigma
@@ -90,6 +101,7 @@ class CellRows:
             "longest_hold": staleness.longest_hold.ravel(),
             "failure_frame": part.failure[f].ravel(),
             **{metric: part.scores[metric][f].ravel() for metric in METRICS},
+            **_modelled(part, f),
         }
         values["sigma"] = np.tile(self._sigmas, len(replay.sequences))
         rows = len(values["sigma"])
@@ -105,6 +117,16 @@ class CellRows:
         """The file's bytes."""
         self._writer.close()
         return self._file.getvalue()
+
+
+def _modelled(part: Evaluation, f: int) -> dict[str, Floats]:
+    """The modelled scores of a forecaster by sequence and sigma."""
+    modelled, columns = part.modelled, {}
+    for metric in MODELLED:
+        for end, values in zip(_ENDS, (modelled.mean, modelled.low, modelled.high)):
+            scores = np.where(modelled.applies[:, None], values[metric][f], np.nan)
+            columns[f"modelled_{metric}{end}"] = scores.ravel()
+    return columns
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> Any:

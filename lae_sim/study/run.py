@@ -23,7 +23,13 @@ from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
 from lae_sim.study.store import Store
-from lae_sim.study.summary import Scores, compare_traces, read_scores, summarise_study
+from lae_sim.study.summary import (
+    Scores,
+    compare_traces,
+    rankings_of,
+    read_scores,
+    summarise_study,
+)
 from lae_sim.study.work import Description, Work, attempt
 from lae_sim.trace.describe import is_measured
 
@@ -55,7 +61,7 @@ class StudyResults:
         ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
         ...     )
         ...     results.to_frame().shape
-        (16, 30)
+        (16, 39)
         >>> results
         <StudyResults of 2 settings, 2 cells in ...>
         >>> results.summary_frame()[["forecaster", "auc", "vs_hold_auc"]].round(3)
@@ -116,6 +122,21 @@ class StudyResults:
                 latencies.setdefault(unscaled, {})[row.latency] = None
         return [f"initialisation at {', '.join(some)}: {how}" for how, some in latencies.items()]
 
+    def ranked_by(self) -> list[str]:
+        """By what is ranked, compared and tested, and why; nothing where nothing is modelled."""
+        rankings = dict.fromkeys(rankings_of(self.scores).values())
+        return [str(ranking) for ranking in rankings if ranking.reason]
+
+    def search_sources(self) -> list[str]:
+        """What is known of the reach of the tracker of each trace, where something is modelled."""
+        sources = {
+            f"{scores.setting.trace.label}: modelled: {about['modelled']['source']}": None
+            for scores in self.scores
+            for about in scores.about
+            if about["modelled"]
+        }
+        return list(sources)
+
     def notes(self) -> list[str]:
         """What keeps the figures from being what their names promise, each once."""
         members: dict[str, set[tuple[str, ...]]] = {}
@@ -130,6 +151,12 @@ class StudyResults:
             if source.metadata.timing_note:
                 notes.append(f"{source.input.label}: times: {source.metadata.timing_note}")
         notes += [*self.init_sources(assumed=True), *self.training]
+        notes += self.search_sources()
+        if any(scores.known is False for scores in self.scores):
+            notes.append(
+                'measure c: lae-sim profile --gaps, then passes = ["TRACE.gaps.parquet"]; or name '
+                'it: search = "c=0.7"; search = "off" leaves the model out'
+            )
         notes += [
             note for scores in self.scores for about in scores.about for note in about["notes"]
         ]

@@ -16,6 +16,7 @@ from lae_sim.engine.clock import exact, parse_duration, parse_fps, split_init, w
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
+from lae_sim.replay.search import parse_search
 from lae_sim.replay.world import (
     check_sigmas,
     flag,
@@ -43,6 +44,8 @@ class Study:
         traces: files, folders, globs and URLs.
         timing: traces of other devices to take the times from too; each goes with the traces of
             its tracker and dataset. The traces' own times always count.
+        passes: strided and gap passes (see :meth:`lae_sim.replay.world.World.of`); each goes with
+            the traces of its tracker and dataset.
         forecasters: names, as on command lines; hold is always there.
         policies: which frame a free tracker takes.
         fps: world frame rates; None is each trace's own.
@@ -51,6 +54,10 @@ class Study:
         init: what the initialisation takes, one or several durations, each with every latency;
             none: what the latency says.
         scales: exact factors on all times.
+        search: what is assumed of the trackers' reach (see :func:`.search.parse_search`).
+        pre_forecaster: names of what says where the trackers search, in the search model; None, or
+            ``"none"``, is their last answer.
+        keep_size: whether a pre-forecaster says the centre only.
         sigmas: permitted latencies in frames, ascending.
         conventions: how frames and thresholds count.
         costs: what forecasting costs, such as ``"2ms"`` or ``"kalman=2ms"``.
@@ -74,12 +81,16 @@ class Study:
 
     traces: tuple[str, ...]
     timing: tuple[str, ...] = ()
+    passes: tuple[str, ...] = ()
     forecasters: tuple[str, ...] = ("hold", "kalman")
     policies: tuple[str, ...] = ("latest",)
     fps: tuple[Fraction | None, ...] = (None,)
     latencies: tuple[str, ...] = ("recorded",)
     init: tuple[str, ...] = ()
     scales: tuple[Fraction, ...] = (Fraction(1),)
+    search: tuple[str, ...] = ("trace",)
+    pre_forecaster: tuple[str | None, ...] = (None,)
+    keep_size: bool = False
     sigmas: tuple[Fraction, ...] = (Fraction(0),)
     conventions: tuple[str, ...] = ("pysot",)
     costs: tuple[str, ...] = ()
@@ -111,6 +122,14 @@ class Study:
         if "offline" in self.forecasters:
             raise LaeError("forecasters: offline is the tracker's own score, and always there")
         check_sigmas(self.sigmas)
+        for search in self.search:
+            named("search", parse_search, search)
+        if any(self.pre_forecaster) and "off" in self.search:
+            raise LaeError(
+                "pre_forecaster: what it is worth is the search model's: do not turn it off"
+            )
+        if self.keep_size and not any(self.pre_forecaster):
+            raise LaeError("keep_size: it is a way to use a pre_forecaster")
         if any(scale < 0 for scale in self.scales):
             raise LaeError("scales: times cannot be scaled by less than 0")
         if self.require_auc is not None and not 0 < self.require_auc < 1:
@@ -232,6 +251,10 @@ def _rate(value: Any) -> Fraction | None:
     return None if value is None or value == "trace" else parse_fps(value)
 
 
+def _forecaster(value: Any) -> str | None:
+    return None if value is None or value == "none" else text(value)
+
+
 def _duration(value: Any) -> str:
     parse_duration(value)
     return text(value)
@@ -257,12 +280,16 @@ def _several(parse: Callable[[Any], Value]) -> Callable[[Any], tuple[Value, ...]
 _KEYS: Mapping[str, tuple[str, Callable[[Any], Any]]] = {
     "traces": ("traces", _several(_trace)),
     "timing": ("timing", _several(_trace)),
+    "passes": ("passes", _several(_trace)),
     "forecasters": ("forecasters", _several(text)),
     "policies": ("policies", _several(text)),
     "fps": ("fps", _several(_rate)),
     "latencies": ("latencies", _several(text)),
     "init": ("init", _several(_duration)),
     "scales": ("scales", _several(exact)),
+    "search": ("search", _several(text)),
+    "pre_forecaster": ("pre_forecaster", _several(_forecaster)),
+    "keep_size": ("keep_size", flag),
     "sigma": ("sigmas", _sigmas),
     "conventions": ("conventions", _several(text)),
     "costs": ("costs", _several(text)),

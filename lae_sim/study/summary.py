@@ -16,13 +16,21 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats
-from lae_sim.comparison.statistics import RESAMPLES, Bootstrap, holm
+from lae_sim.comparison.statistics import RESAMPLES, Bootstrap, Interval, holm
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.metrics import METRICS
+from lae_sim.evaluation.modelled import MODELLED, Ranking, interval, summed
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.cells import Cell, Setting
 from lae_sim.study.plan import Plan, Source
-from lae_sim.study.records import MEAN, Comparison, Staleness, SummaryRow, Uncertainty
+from lae_sim.study.records import (
+    MEAN,
+    Comparison,
+    Modelled,
+    Staleness,
+    SummaryRow,
+    Uncertainty,
+)
 from lae_sim.study.rows import COLUMNS, read_rows
 from lae_sim.study.store import Store
 from lae_sim.trace.columns import to_numpy
@@ -38,11 +46,14 @@ class Scores:
         forecaster, convention: names.
         sequences: names, S of them.
         means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``;
-            of ``mismatch_max`` and ``longest_hold`` the largest (frames).
+            of ``mismatch_max`` and ``longest_hold`` the largest (frames). Where something is
+            modelled, ``modelled_auc`` and ``modelled_dp20`` are there and below, those of exact
+            replays as they are.
         repeated: ``auc``, ``dp20`` and ``failure_frame`` at the first sigma, float64 [R, S].
         over_sigmas: ``auc`` and ``dp20`` as plain means over sigma, float64 [R, S].
-        once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms``, ``init_ms`` and
-            the offline scores, float64 [S].
+        once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms``, ``init_ms``,
+            ``lost_share`` and the offline scores, float64 [S].
+        modelled_sequences: in how many the search model says something.
         about: of each cell (see :class:`lae_sim.study.cells.Result`).
     """
 
@@ -56,10 +67,22 @@ class Scores:
     over_sigmas: Mapping[str, Floats]
     once: Mapping[str, Floats]
     about: tuple[Mapping[str, Any], ...]
+    modelled_sequences: int
+
+    @property
+    def known(self) -> bool | None:
+        """Whether the reach is known; None where nothing is modelled."""
+        found = {each["modelled"]["known"] for each in self.about if each["modelled"]}
+        return found.pop() if found else None
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether every output follows the same frame as when it was recorded."""
+        return not any(each["approximate_outputs"] for each in self.about)
 
     @property
     def group(self) -> tuple[str, ...]:
-        """What scores must share to be compared: dataset, world, latency, convention."""
+        """What scores must share to be compared: dataset, world, latency, search, convention."""
         setting = self.setting
         return (
             self.source.metadata.dataset,
@@ -67,6 +90,8 @@ class Scores:
             str(setting.fps),
             setting.latency,
             str(setting.world.scale),
+            setting.world.search,
+            setting.pre_forecaster,
             self.convention,
         )
 
@@ -83,7 +108,9 @@ class Scores:
 _WORST = {"mismatch_max", "longest_hold"}
 _STALENESS = ("mismatch_mean", *sorted(_WORST))
 _REPEATED = ("auc", "dp20", "failure_frame")
-_ONCE = ("world_frames", "processed", "elapsed_ms", "init_ms", *(f"offline_{m}" for m in METRICS))
+_ONCE = ("world_frames", "processed", "elapsed_ms", "init_ms", "lost_share",
+         *(f"offline_{m}" for m in METRICS))  # fmt: skip
+_MODELLED = tuple(f"modelled_{metric}" for metric in MODELLED)
 
 
 def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
@@ -102,17 +129,24 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
     """The scores of cells that differ in their repetitions alone."""
     first = cells[0]
     count = len(first.setting.world.sigmas)
-    numbers = [*METRICS, *_STALENESS]
+    about = tuple(store.about(cell) for cell in cells)
+    modelled = _MODELLED if any(each["modelled"] for each in about) else ()
+    numbers = [*METRICS, *_STALENESS, *modelled]
     totals: dict[str, Any] = {}
-    repeated: dict[str, list[Floats]] = {name: [] for name in _REPEATED}
-    over_sigmas: dict[str, list[Floats]] = {name: [] for name in ("auc", "dp20")}
+    repeated: dict[str, list[Floats]] = {name: [] for name in (*_REPEATED, *modelled)}
+    over_sigmas: dict[str, list[Floats]] = {name: [] for name in ("auc", "dp20", *modelled)}
+    applies: Bools | None = None
     names: tuple[str, ...] = ()
     for cell in cells:
-        wanted = dict.fromkeys([*numbers, *_REPEATED, *_ONCE, "sequence", "repetition"])
-        rows = read_rows(store.rows(cell), list(wanted))
+        wanted = dict.fromkeys([*numbers, *_REPEATED, *_ONCE])
+        rows = read_rows(store.rows(cell), [*wanted, "sequence", "repetition"])
+        exact = np.isnan(_column(rows, "lost_share"))
 
-        def column(name: str, rows: Any = rows) -> Floats:
-            return to_numpy(rows.column(name).chunk(0), COLUMNS[name]).astype(np.float64)
+        def column(name: str, rows: Any = rows, exact: Bools = exact) -> Floats:
+            values = _column(rows, name)
+            if name in _MODELLED:
+                return np.where(exact, _column(rows, name.removeprefix("modelled_")), values)
+            return np.where(exact, 0.0, values) if name == "lost_share" else values
 
         entries = rows.num_rows // count
         sequences = rows.column("sequence").chunk(0)  # its take would import pyarrow.compute
@@ -123,9 +157,11 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
             np.array([place[name] for name in of_entry]), column("repetition")[::count],
         ))  # fmt: skip
         shape = (cell.setting.count, len(names), count)
-        for name in dict.fromkeys([*numbers, *_REPEATED, *_ONCE]):
+        here = np.logical_or.reduce(~exact[::count][order].reshape(shape[:2]))
+        applies = here if applies is None else np.logical_or(applies, here)
+        for name in wanted:
             values = column(name).reshape(entries, count)[order].reshape(shape)
-            if name in _REPEATED:
+            if name in repeated:
                 repeated[name].append(values[:, :, 0])
             if name in over_sigmas:
                 over_sigmas[name].append(values.mean(axis=2))
@@ -147,8 +183,13 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
         repeated={name: np.concatenate(parts) for name, parts in repeated.items()},
         over_sigmas={name: np.concatenate(parts) for name, parts in over_sigmas.items()},
         once={name: totals[name] for name in _ONCE},
-        about=tuple(store.about(cell) for cell in cells),
+        about=about,
+        modelled_sequences=0 if applies is None else int(applies.sum()),
     )
+
+
+def _column(rows: Any, name: str) -> Floats:
+    return to_numpy(rows.column(name).chunk(0), COLUMNS[name]).astype(np.float64)
 
 
 def summarise_study(
@@ -167,10 +208,12 @@ def summarise_study(
     """
     bootstrap = Bootstrap(resamples, seed)
     hold = {each.identity: each for each in scores if each.forecaster == "hold"}
+    rankings = rankings_of(scores)
     rows: list[SummaryRow] = []
     rivals: dict[tuple[Any, ...], list[int]] = {}
     for each in scores:
         for row in _rows(each, hold.get(each.identity), bootstrap):
+            row = replace(row, ranked_by=rankings[each.group].by)
             rival = (*each.group, each.sequences, each.forecaster, row.sigma)
             rivals.setdefault(rival, []).append(len(rows))
             rows.append(row)
@@ -178,6 +221,14 @@ def summarise_study(
         for place in _front([rows[place] for place in places]):
             rows[places[place]] = replace(rows[places[place]], pareto=True)
     return rows
+
+
+def rankings_of(scores: Sequence[Scores]) -> dict[tuple[str, ...], Ranking]:
+    """By what the scores of each group are ranked and compared."""
+    replays: dict[tuple[str, ...], list[tuple[bool | None, bool]]] = {}
+    for each in scores:
+        replays.setdefault(each.group, []).append((each.known, each.is_exact))
+    return {group: Ranking.of(some) for group, some in replays.items()}
 
 
 def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator[SummaryRow]:
@@ -195,6 +246,8 @@ def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator
         fps=setting.fps,
         latency=setting.latency,
         scale=setting.world.scale,
+        search=setting.world.search,
+        pre_forecaster=setting.pre_forecaster,
         convention=scores.convention,
         forecaster=scores.forecaster,
         sequences=len(scores.sequences),
@@ -217,6 +270,7 @@ def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator
             scores={metric: _mean(scores.means[metric][:, s]) for metric in METRICS},
             uncertainty=_uncertainty(scores, hold, bootstrap, over_sigmas=False) if s == 0 else {},
             staleness=_staleness(scores, s),
+            modelled=_modelled(scores, [s], "first" if s == 0 else None),
         )
     if set(SIGMA_GRID) <= set(sigmas):
         grid = [s for s, sigma in enumerate(sigmas) if sigma in SIGMA_GRID]
@@ -225,15 +279,43 @@ def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator
             row,
             scores={metric: _mean_of_means(scores.means[metric][:, grid]) for metric in METRICS},
             uncertainty=_uncertainty(scores, hold, bootstrap, over_sigmas=True) if whole else {},
+            modelled=_modelled(scores, grid, "mean" if whole else None),
         )
+
+
+def _modelled(scores: Scores, at: Sequence[int], draws: str | None) -> Modelled | None:
+    """Scores under the search model, as plain means over some sigmas.
+
+    Args:
+        scores: of all sequences and repetitions.
+        at: indices of the sigmas.
+        draws: which joint draws of the cells make the intervals; None for none.
+    """
+    cells = [each["modelled"] for each in scores.about if each["modelled"]]
+    if not cells:
+        return None
+    means = {m: _mean_of_means(scores.means[f"modelled_{m}"][:, at]) for m in MODELLED}
+    intervals = {}
+    for metric in MODELLED if draws is not None else ():
+        runs = summed([np.array(cell[draws][metric]) for cell in cells])
+        # of one sequence, what is drawn and what is unexplained are the same in all repetitions
+        each = runs[:, None, :, None] / sum(about["repetitions"] for about in scores.about)
+        rest = max(cell["unexplained"][metric] for cell in cells)
+        low, high = interval(each, cells[0]["known"], rest, scores.modelled_sequences)
+        if np.isfinite(low).all():
+            # in whatever chunks repetitions are dealt out, whose sums differ in the last bits
+            intervals[metric] = Interval(*(round(end.item(), 12) for end in (low, high)))
+    outputs = scores.once["processed"]
+    lost = float(scores.once["lost_share"] @ outputs / outputs.sum())
+    return Modelled(cells[0]["known"], lost, means, intervals)
 
 
 def _uncertainty(
     scores: Scores, hold: Scores | None, bootstrap: Bootstrap, over_sigmas: bool
 ) -> dict[str, Uncertainty]:
-    """How sure mean AUC and DP are, and what is won over hold."""
+    """How sure mean AUC and DP are, and what is won over hold; those of a known reach too."""
     uncertain = {}
-    for metric in ("auc", "dp20"):
+    for metric in (*MODELLED, *(_MODELLED if scores.known else ())):
         values = scores.by_repetition(over_sigmas)[metric]
         base = None if hold is None or hold is scores else hold.by_repetition(over_sigmas)[metric]
         kept = ~np.isnan(values.mean(axis=0))
@@ -247,7 +329,8 @@ def _uncertainty(
             [means] = bootstrap.means(mean[None])
             uncertain[metric] = Uncertainty(bootstrap.interval(means), jitter)
             continue
-        bare, offline = base[:, kept].mean(axis=0), scores.once[f"offline_{metric}"][kept]
+        offline = scores.once[f"offline_{metric.removeprefix('modelled_')}"][kept]
+        bare = base[:, kept].mean(axis=0)
         means, held, losses = bootstrap.means(np.stack([mean, bare, offline - bare]))
         difference, share = bootstrap.compare(mean, bare, means, held), None
         if not np.isnan(offline).any():
@@ -305,7 +388,7 @@ def _front(rivals: Sequence[SummaryRow]) -> list[int]:
     known = [
         (place, auc, row.elapsed_ms)
         for place, row in enumerate(rivals)
-        if (auc := row.scores["auc"]) is not None and row.elapsed_ms is not None
+        if (auc := row.score("auc")) is not None and row.elapsed_ms is not None
     ]
     return [
         place
@@ -340,26 +423,27 @@ def compare_traces(
         grid of sigmas, of the means over it); p-values are corrected (:func:`.statistics.holm`)
         for the number of pairs of the same setting and forecaster.
     """
-    bootstrap = Bootstrap(resamples, seed)
+    bootstrap, rankings = Bootstrap(resamples, seed), rankings_of(scores)
     together: dict[tuple[str, ...], list[Scores]] = {}
     for each in scores:
         together.setdefault((*each.group, each.forecaster), []).append(each)
     comparisons = []
     for group in together.values():
-        pairs = [_pair(a, b, bootstrap) for a, b in combinations(group, 2)]
+        ranking = rankings[group[0].group]
+        pairs = [_pair(a, b, ranking, bootstrap) for a, b in combinations(group, 2)]
         known = [pair for pair in pairs if pair is not None]
         corrected = holm([pair.difference.p for pair in known])
         comparisons += [replace(pair, p_holm=p) for pair, p in zip(known, corrected)]
     return comparisons
 
 
-def _pair(a: Scores, b: Scores, bootstrap: Bootstrap) -> Comparison | None:
+def _pair(a: Scores, b: Scores, ranking: Ranking, bootstrap: Bootstrap) -> Comparison | None:
     """A against B; None if they have no sequences in common that count."""
     setting = a.setting
     whole = set(SIGMA_GRID) == set(setting.world.sigmas)
     both = sorted(set(a.sequences) & set(b.sequences))
     first, second = (
-        one.by_repetition(whole)["auc"][:, [one.sequences.index(name) for name in both]]
+        ranked(one.by_repetition(whole), ranking)[:, [one.sequences.index(name) for name in both]]
         for one in (a, b)
     )
     kept = ~np.isnan(first.mean(axis=0) + second.mean(axis=0))
@@ -379,6 +463,8 @@ def _pair(a: Scores, b: Scores, bootstrap: Bootstrap) -> Comparison | None:
         fps=setting.fps,
         latency=setting.latency,
         scale=setting.world.scale,
+        search=setting.world.search,
+        pre_forecaster=setting.pre_forecaster,
         convention=a.convention,
         forecaster=a.forecaster,
         sigma=MEAN if whole else setting.world.sigmas[0],
@@ -388,7 +474,14 @@ def _pair(a: Scores, b: Scores, bootstrap: Bootstrap) -> Comparison | None:
         difference=difference,
         better_here=_superiority(here) if jitter else None,
         better=_superiority(margins),
+        ranked_by=ranking.by,
     )
+
+
+def ranked(values: Mapping[str, Floats], ranking: Ranking) -> Floats:
+    """The AUC that counts, of ``means``, ``repeated`` or ``over_sigmas`` of some scores."""
+    name = "modelled_auc" if ranking.modelled else "auc"
+    return values.get(name, values["auc"])  # without the first where the replay is exact
 
 
 def _superiority(margins: Floats) -> float:

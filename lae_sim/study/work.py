@@ -84,8 +84,7 @@ def _cell_by_cell(task: Task) -> list[Result | Failure]:
 def _inputs(work: Work) -> list[Input]:
     if isinstance(work, Description):
         return [work.trace]
-    setting = _setting(work)
-    return [each for each in (setting.trace, setting.timing) if each is not None]
+    return _setting(work).inputs
 
 
 def _setting(work: Task | Search) -> Setting:
@@ -106,7 +105,13 @@ def work_in_words(work: Work) -> str:
 
 def _in_words(setting: Setting, scale: bool = True) -> str:
     factor = f" x {setting.world.scale}" if scale and setting.world.scale != 1 else ""
-    return f"{setting.run}, {setting.policy}, {setting.fps} fps, {setting.latency}{factor}"
+    searched = (
+        "" if setting.world.search in ("off", "trace") else f", search {setting.world.search}"
+    )
+    if setting.world.pre_forecaster is not None:
+        searched += f", pre-forecaster {setting.pre_forecaster}"
+    times = f"{setting.latency}{factor}"
+    return f"{setting.run}, {setting.policy}, {setting.fps} fps, {times}{searched}"
 
 
 def cell_in_words(cell: Cell) -> str:

@@ -153,6 +153,10 @@ class Metadata:
         half_side, window, source = (declared.get(k) for k in ("half_side", "window", "source"))
         return Search(float(half_side), window, source)
 
+    def goes_with(self, other: Metadata) -> bool:
+        """Whether another trace is of the same tracker on the same dataset."""
+        return (self.tracker, self.dataset) == (other.tracker, other.dataset)
+
     @property
     def profiled(self) -> bool:
         """Whether the trace names the clock of its times, as those of the profiler do."""

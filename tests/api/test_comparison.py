@@ -25,7 +25,9 @@ SLOW, FAST = TRACES / "synthetic-slow.parquet", TRACES / "synthetic-fast.parquet
 
 @pytest.fixture(scope="module")
 def result() -> lae_sim.ComparisonResult:
-    return lae_sim.compare_forecasters([SLOW, FAST], forecasters=["kalman", "least-squares"])
+    return lae_sim.compare_forecasters(
+        [SLOW, FAST], forecasters=["kalman", "least-squares"], search="off"
+    )
 
 
 def test_scores_are_those_of_evaluating(result: lae_sim.ComparisonResult) -> None:
@@ -47,7 +49,8 @@ def test_the_summary_is_that_of_the_room_below(result: lae_sim.ComparisonResult)
     forecasters = {
         name: lae_sim.load_forecaster(name) for name in ("hold", "kalman", "least-squares")
     }
-    expected = summarise(score_forecasters(traces, forecasters), metrics=("auc", "dp20"), seed=0)
+    scores = score_forecasters(traces, forecasters, [lae_sim.World.of(search="off")])
+    expected = summarise(scores, metrics=("auc", "dp20"), seed=0)
     pd.testing.assert_frame_equal(result.summary, expected)
     means = result.to_frame().groupby(["trace", "forecaster", "metric"])["value"].mean()
     for row in result.summary.itertuples():
@@ -75,6 +78,12 @@ def test_the_command_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
         rows = json.loads(table.to_json(orient="records", double_precision=15))
         assert len(rows) == len(document[key])
         for row, printed in zip(rows, document[key], strict=True):
+            modelled = printed.pop("modelled", None) or {}
+            assert set(modelled) >= {"c_known", "auc", "auc_low", "auc_high"} or not modelled
+            for name, value in modelled.items():
+                own = name in ("c_known", "lost_share")
+                assert row.pop(name if own else f"modelled_{name}") == pytest.approx(value)
+            row = {name: value for name, value in row.items() if name in printed}
             assert row == pytest.approx(printed, abs=1e-9)
     assert document["notes"] == result.notes
 
@@ -93,7 +102,7 @@ def test_what_must_be_trained_is_trained_on_other_sequences() -> None:
 
 
 def test_the_grid_is_compared_as_means() -> None:
-    result = lae_sim.compare_forecasters(SLOW, forecasters="kalman", sigma="grid")
+    result = lae_sim.compare_forecasters(SLOW, forecasters="kalman", sigma="grid", search="off")
     assert result.metrics == ("mauc", "mdp20")
     assert set(result.summary["metric"]) == {"mauc", "mdp20"}
     pd.testing.assert_frame_equal(
@@ -144,3 +153,82 @@ def test_a_progress_bar_counts_steps(capsys: pytest.CaptureFixture[str]) -> None
     out, err = capsys.readouterr()
     assert out == ""
     assert "4/4" in err
+
+
+FAR = {"latency": "constant:90ms,init=600ms", "sequences": ("bike-pan", "car-chase", "truck-far")}
+
+
+def test_forecasters_are_ranked_by_the_model_where_the_reach_is_known() -> None:
+    result = lae_sim.compare_forecasters(SLOW, forecasters="kalman", search="c=0.3", **FAR)
+    assert result.ranking.modelled
+    assert result.metrics == ("modelled_auc", "modelled_dp20", "auc", "dp20")
+    assert result.notes[-1] == "ranked by the modelled scores: the reach is given or measured"
+    evaluated = lae_sim.evaluate(SLOW, search="c=0.3", **FAR)
+    means = evaluated.summary.set_index("forecaster")
+    summary = result.summary.set_index(["metric", "forecaster"])
+    for name in ("hold", "kalman"):
+        for metric in result.metrics:
+            assert summary.loc[(metric, name), "mean"] == pytest.approx(means.loc[name, metric])
+        for end in ("modelled_auc", "modelled_auc_low", "modelled_dp20_high"):
+            assert summary.loc[("auc", name), end] == means.loc[name, end]
+    won = means.loc["kalman", "modelled_auc"] - means.loc["hold", "modelled_auc"]
+    assert summary.loc[("modelled_auc", "kalman"), "vs_hold"] == pytest.approx(won)
+    assert "modelled AUC" in str(result)
+    assert "modelled AUC hold" in repr(result)
+    assert isinstance(result.plot(), Figure)
+    assert set(result.attributes["metric"]) == set(result.metrics)
+
+
+def test_an_assumed_range_does_not_rank() -> None:
+    plain, beside = (
+        lae_sim.compare_forecasters(SLOW, forecasters="kalman", search=search, **FAR)
+        for search in ("off", "trace")
+    )
+    assert not beside.ranking.modelled
+    assert beside.metrics == plain.metrics == ("auc", "dp20")
+    assert beside.notes[-1] == (
+        "ranked by the scores of the recorded boxes: the reach is unknown, and the model's are for "
+        "a range of it"
+    )
+    assert any("measure c: lae-sim profile --gaps" in note for note in beside.notes)
+    pd.testing.assert_frame_equal(beside.summary[list(plain.summary)], plain.summary)
+    hold = beside.summary.query("forecaster == 'hold' and metric == 'auc'").iloc[0]
+    assert not hold["c_known"]
+    assert hold["modelled_auc_low"] <= hold["modelled_auc"] <= hold["modelled_auc_high"]
+    assert hold["modelled_auc"] < hold["mean"]
+    assert beside.summary.query("forecaster == 'offline'")["modelled_auc"].isna().all()
+    text = str(beside)
+    assert "modelled AUC" in text.splitlines()[2]
+    assert "modelled" not in str(plain)
+    assert (plain.search, plain.notes) == (
+        [],
+        [note for note in beside.notes if note in plain.notes],
+    )
+
+
+def test_means_over_the_grid_are_modelled_too() -> None:
+    result = lae_sim.compare_forecasters(
+        SLOW, forecasters="hold", search="c=0.3", sigma="grid", **FAR
+    )
+    assert result.metrics == ("modelled_mauc", "modelled_mdp20", "mauc", "mdp20")
+    (row,) = result.summary.query("metric == 'modelled_mauc' and forecaster == 'hold'").itertuples()
+    single = lae_sim.evaluate(SLOW, search="c=0.3", sigma="grid", **FAR).summary
+    single = single.query("forecaster == 'hold'")
+    assert row.mean == pytest.approx(single["modelled_auc"].mean())
+    assert row.modelled_mauc == pytest.approx(row.mean)
+    assert single["modelled_auc_low"].mean() - 1e-9 <= row.modelled_mauc_low < row.mean
+    assert "modelled mAUC" in str(result)
+
+
+def test_a_pre_forecaster_says_where_the_tracker_searches() -> None:
+    result = lae_sim.compare_forecasters(
+        SLOW, forecasters="kalman", search="c=0.3", pre_forecaster="kalman", keep_size=True, **FAR
+    )
+    means = lae_sim.evaluate(
+        SLOW, search="c=0.3", pre_forecaster="kalman", keep_size=True, **FAR
+    ).summary.set_index("forecaster")
+    summary = result.summary.set_index(["metric", "forecaster"])
+    for name in ("hold", "kalman"):
+        expected = means.loc[name, "modelled_auc"]
+        assert summary.loc[("modelled_auc", name), "mean"] == pytest.approx(expected)
+    assert any(note.startswith("pre-forecaster kalman says where") for note in result.notes)

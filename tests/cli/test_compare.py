@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from places import REPOSITORY
+from restarted import gap_pass
 
 import lae_sim
 from lae_sim.cli.compare import main
@@ -187,8 +188,35 @@ def test_scales_and_the_grid_of_sigmas(tmp_path: Path) -> None:
     table = pd.read_parquet(path)
     assert set(table["scale"]) == {0.5, 2.0}
     assert len(set(table["sigma"])) == 51
-    assert len(table) == 2 * 51 * 4 * 3
+    assert len(table[~table["metric"].str.startswith("modelled_")]) == 2 * 51 * 4 * 3
     assert np.isfinite(table["value"]).all()
+
+
+def test_the_search_model_beside_and_off(tmp_path: Path) -> None:
+    options = (SLOW, *FEW, "--forecaster", "kalman", "--latency", "constant:1ms", "constant:90ms")
+    document = json.loads(compare_here(*options, "--search", "c=0.3", "--json"))
+    assert document["ranked_by"] == "modelled"
+    assert [each["source"] for each in document["search"]] == ["c = 0.3, as given"]
+    for row in document["summary"]:
+        exact = row["latency"] == "constant:1ms"
+        assert (row["modelled"] is None) == (exact or row["forecaster"] == "offline")
+        if row["modelled"]:
+            assert row["modelled"]["c_known"]
+            low, auc, high = (row["modelled"][f"auc{end}"] for end in ("_low", "", "_high"))
+            assert low < auc < high
+            assert row["metric"] != "modelled_auc" or row["mean"] == pytest.approx(auc)
+    gaps = gap_pass(lae_sim.read_trace(SLOW).metadata, tmp_path / "slow.gaps.parquet")
+    measured = json.loads(compare_here(*options, "--strided", gaps, "--json"))
+    assert "measured by 400 restarts" in measured["search"][0]["source"]
+    assert measured["search"][0]["reach"]["centre"] == pytest.approx(0.3, abs=0.05)
+    assert measured["ranked_by"] == "modelled"
+    off = json.loads(compare_here(*options, "--search", "off", "--json"))
+    assert (off["ranked_by"], off["search"]) == ("recorded", [])
+    assert {row["modelled"] for row in off["summary"]} == {None}
+    assert "ranked by" not in compare_here(*options, "--search", "off")
+    text = compare_here(*options, "--search", "c=0.3", "--pre-forecaster", "kalman", "--keep-size")
+    assert "ranked by the modelled scores: the reach is given or measured" in text
+    assert "pre-forecaster kalman says where the tracker searches, the size is kept" in text
 
 
 def test_it_stops_quietly_when_nobody_reads() -> None:
@@ -231,6 +259,12 @@ def test_help_has_examples_and_names_the_forecasters() -> None:
         (["--latency", "nothing"], "no latency 'nothing'"),
         (["--latency-scale", "-1"], "-1"),
         (["--convention", "nothing"], "no convention 'nothing'"),
+        (["--search", "c=far"], "search: no search 'c=far': there are off, trace, c=0.7"),
+        (["--search", "off", "--pre-forecaster", "kalman"], "do not turn it off"),
+        (["--pre-forecaster", "nobody"], "no forecaster 'nobody'"),
+        (["--pre-forecaster", "tuned-kalman"], "tuned-kalman must be trained"),
+        (["--keep-size"], "keep_size is a way to use a pre_forecaster"),
+        (["--strided", "missing.parquet"], "passes: missing.parquet: no such file"),
         (["--cost", "nobody=1ms"], "no forecaster 'nobody'"),
         (["--folds", "1", "--forecaster", "tuned-kalman"], "at least two folds"),
         (["--sequence", "nothing"], "no sequence 'nothing'"),

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from places import REPOSITORY
+from restarted import gap_pass
 
 import lae_sim
 from lae_sim.cli.study import main
@@ -220,7 +221,8 @@ def test_success_and_precision_curves_are_kept(tmp_path: Path) -> None:
 def test_repetitions_are_dealt_out_in_chunks_that_change_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    more: dict[str, Any] = {"latencies": ("bootstrap",), "repetitions": 5}
+    more: dict[str, Any] = {"latencies": ("bootstrap",), "repetitions": 5, "search": ("c=0.3",)}
+    more["scales"] = (Fraction(3),)
     whole = run(tmp_path / "a", **more)
     monkeypatch.setattr("lae_sim.study.plan.CHUNK_FRAMES", 2 * 2400)
     parts = run(tmp_path / "b", **more)
@@ -230,6 +232,7 @@ def test_repetitions_are_dealt_out_in_chunks_that_change_nothing(
     pd.testing.assert_frame_equal(*tables)
     assert whole.summary == parts.summary
     assert whole.comparisons == parts.comparisons
+    assert all(row.ranked_by == "modelled" for row in whole.summary)
 
 
 def test_jitter_has_its_own_interval_and_probability(tmp_path: Path) -> None:
@@ -304,6 +307,208 @@ def test_what_a_required_auc_asks_for_is_true(tmp_path: Path) -> None:
     (never,) = flat_rows(run(tmp_path / "never", study).required)
     assert (never["scale"], never["speed_up"], never["beyond"]) == (None, None, "0")
     assert never["auc_without_latency"] < 0.9
+
+
+FAR: dict[str, Any] = {"latencies": ("constant:90ms,init=600ms",), "search": ("c=0.3",)}
+
+
+def test_modelled_scores_are_those_of_replay(tmp_path: Path) -> None:
+    results = run(tmp_path, sigmas=SIGMA_GRID, **FAR)
+    single = lae_sim.evaluate(
+        SLOW, latency=FAR["latencies"][0], search="c=0.3", sigma="grid", sequences=FEW
+    )
+    keys = ["sequence", "forecaster", "sigma"]
+    table = results.to_frame().query("trace == 'synthetic-slow'").set_index(keys).sort_index()
+    expected = single.to_frame().set_index(keys).sort_index()
+    for name in ("modelled_auc", "modelled_auc_low", "modelled_auc_high", "modelled_dp20_high"):
+        np.testing.assert_array_equal(table[name], expected[name])
+    assert (table["lost_share"] > 0).any()
+    rows = {(r["trace"], r["forecaster"], r["sigma"]): r for r in flat_rows(results.summary)}
+    means = single.summary.set_index(["forecaster", "sigma"])
+    for forecaster in ("hold", "kalman"):
+        first = rows["synthetic-slow", forecaster, "0"]
+        for name in ("modelled_auc", "modelled_auc_low", "modelled_auc_high", "modelled_dp20_low"):
+            assert first[name] == pytest.approx(means.loc[(forecaster, 0.0), name], abs=1e-11)
+        assert first["c_known"]
+        assert 0 < first["lost_share"] < 1
+        over = rows["synthetic-slow", forecaster, "mean"]
+        assert over["modelled_auc"] == pytest.approx(means.loc[forecaster]["modelled_auc"].mean())
+        assert over["modelled_auc_low"] < over["modelled_auc"] < over["modelled_auc_high"]
+        later = rows["synthetic-slow", forecaster, "1/50"]
+        assert later["modelled_auc"] == pytest.approx(means.loc[(forecaster, 0.02), "modelled_auc"])
+        assert "modelled_auc_low" not in later
+
+
+def test_a_known_reach_ranks_by_the_model_and_an_assumed_one_does_not(tmp_path: Path) -> None:
+    results = run(tmp_path, **{**FAR, "search": ("c=0.3", "trace", "off")})
+    table = results.to_frame().set_index(["search", "trace", "forecaster", "sequence"])
+    table = table.sort_index()
+    by_search = {"c=0.3": "modelled", "trace": "recorded", "off": "recorded"}
+    for row in results.summary:
+        assert row.ranked_by == by_search[row.search]
+        scores = table.loc[(row.search, row.trace, row.forecaster)]
+        hold = table.loc[(row.search, row.trace, "hold")]
+        name = "modelled_auc" if row.ranked_by == "modelled" else "auc"
+        assert row.score("auc") == pytest.approx(scores[name].mean())
+        if row.forecaster == "kalman":
+            certainty = row.certainty("auc")
+            assert certainty is not None
+            assert certainty.vs_hold is not None
+            won = scores[name].mean() - hold[name].mean()
+            assert certainty.vs_hold.value == pytest.approx(won)
+        assert (row.modelled is None) == (row.search == "off")
+        assert ("modelled_auc" in row.flat()) == (row.search != "off")
+    for pair in results.comparisons:
+        name = "modelled_auc" if pair.ranked_by == "modelled" else "auc"
+        a, b = (table.loc[(pair.search, each, pair.forecaster), name] for each in (pair.a, pair.b))
+        assert pair.ranked_by == by_search[pair.search]
+        assert pair.difference.value == pytest.approx(a.mean() - b.mean())
+    assert "synthetic-slow: modelled: c = 0.3, as given" in results.notes()
+    assert results.ranked_by() == [
+        "ranked by the modelled scores: the reach is given or measured",
+        "ranked by the scores of the recorded boxes: the reach is unknown, and the model's are for "
+        "a range of it",
+    ]
+    off = run(tmp_path / "off", **{**FAR, "search": ("off",)})
+    assert not any("model" in note for note in off.notes())
+    assert off.ranked_by() == []
+    recorded = {(r.trace, r.forecaster): r for r in results.summary if r.search == "off"}
+    assert {(r.trace, r.forecaster): r for r in off.summary} == recorded
+
+
+def test_the_tables_and_the_page_say_by_what_they_rank(tmp_path: Path) -> None:
+    keys = {"latencies": [FAR["latencies"][0]], "search": ["c=0.3", "off"]}
+    printed = study_command(toml(tmp_path, **keys), cwd=tmp_path)
+    assert "ranked by" in printed.splitlines()[1]
+    assert "modelled scores, and recorded" in printed.splitlines()[0]
+    assert "not computed" not in printed
+    assert "the reach is given or measured" in " ".join(printed.split())
+    one = study_command(toml(tmp_path, **{**keys, "search": "c=0.3"}), cwd=tmp_path)
+    assert one.splitlines()[0].endswith("sigma 0, modelled scores")
+    assert "Trackers against each other, by the modelled AUC" in one
+    page = (tmp_path / "study-results" / "report.html").read_text()
+    assert "synthetic-slow: modelled: c = 0.3, as given" in page
+    assert "ranked by the modelled scores: the reach is given or measured" in page
+    assert ", of the recorded boxes" in page  # the curves
+    ranking = pd.read_csv(tmp_path / "study-results" / "tables" / "ranking.csv")
+    assert ranking["modelled"].is_monotonic_decreasing
+    assert (ranking["modelled low"] < ranking["modelled"]).all()
+    summary = pd.read_csv(tmp_path / "study-results" / "summary.csv")
+    best = summary.sort_values("modelled_auc", ascending=False)
+    np.testing.assert_array_equal(ranking["modelled"], best["modelled_auc"])
+    np.testing.assert_array_equal(
+        ranking["vs hold"].fillna(0), best["vs_hold_modelled_auc"].fillna(0)
+    )
+    off = study_command(toml(tmp_path, **{**keys, "search": "off"}), cwd=tmp_path)
+    assert "model" not in off
+    assert "ranked" not in off
+
+
+def test_a_sweep_of_the_reach_is_drawn(tmp_path: Path) -> None:
+    results = run(tmp_path, **{**FAR, "search": ("c=0.2", "c=0.3", "c=0.4")})
+    lae_sim.write_report(results, tmp_path / "page.html")
+    assert "Over reach c: policy latest" in (tmp_path / "page.html").read_text()
+
+
+def test_gap_passes_find_their_traces_and_are_inputs(tmp_path: Path) -> None:
+    gaps = gap_pass(lae_sim.read_trace(SLOW).metadata, tmp_path / "slow.gaps.parquet")
+    study = Study(
+        (str(SLOW), str(FAST)), sequences=FEW, passes=(str(gaps),), latencies=FAR["latencies"]
+    )
+    results = run(tmp_path / "out", study)
+    rows = {(row.trace, row.forecaster): row for row in results.summary}
+    expected = lae_sim.evaluate(
+        SLOW, latency=FAR["latencies"][0], passes=gaps, sequences=FEW
+    ).summary.set_index("forecaster")
+    for forecaster in ("hold", "kalman"):
+        row = rows["synthetic-slow", forecaster].flat()
+        assert row["c_known"]
+        for name in ("modelled_auc", "modelled_auc_low", "modelled_auc_high", "modelled_dp20_low"):
+            assert row[name] == pytest.approx(expected.loc[forecaster, name], abs=1e-11)
+        fast = rows["synthetic-fast", forecaster]
+        assert fast.modelled is not None
+        assert not fast.modelled.known
+        assert fast.ranked_by == "recorded"  # as is all that it is compared with
+    assert results.plan.sources[-1].input.path == str(gaps)
+    assert run(tmp_path / "out", study).computed == 0
+    gap_pass(lae_sim.read_trace(SLOW).metadata, gaps, centre=0.5)
+    assert run(tmp_path / "out", study).computed == 2  # those of its trace
+    alone = gap_pass(lae_sim.read_trace(FAST).metadata, tmp_path / "fast.gaps.parquet")
+    only = replace(study, traces=(str(SLOW),), passes=(str(alone),))
+    assert run(tmp_path / "only", only).scores[0].known  # a single trace takes what it is given
+    strange = replace(study, traces=(str(SLOW), str(REAL_TIME)), passes=(str(alone),))
+    with pytest.raises(LaeError, match=r"a pass is of fast-and-rough on synthetic: none of the"):
+        run(tmp_path / "strange", strange)
+
+
+def test_strided_passes_go_with_random_times(tmp_path: Path) -> None:
+    slow = lae_sim.read_trace(SLOW)
+    document = json.loads(json.dumps(slow.metadata.document))
+    document["schedule"]["stride"] = "2"
+    recordings = [lae_sim.Recording.new(r.name, r.truth, r.boxes + 3, r.elapsed_ns) for r in slow]
+    strided = tmp_path / "strided.parquet"
+    lae_sim.write_trace(lae_sim.Trace(lae_sim.Metadata.of(document), recordings), strided)
+    study = Study(
+        (str(SLOW),), sequences=FEW, passes=(str(strided),), latencies=("bootstrap",),
+        scales=(Fraction(3),), repetitions=2, seed=5, search=("c=0.3",),
+    )  # fmt: skip
+    table = run(tmp_path / "out", study).to_frame().query("repetition == 0")
+    expected = lae_sim.evaluate(
+        SLOW, latency="bootstrap:5:30", scale=3, passes=strided, sequences=FEW, search="c=0.3"
+    ).to_frame()
+    keys = ["forecaster", "sequence"]
+    for name in ("auc", "modelled_auc"):
+        got, wanted = (each.set_index(keys).sort_index()[name] for each in (table, expected))
+        np.testing.assert_array_equal(got, wanted)
+    plain = lae_sim.evaluate(SLOW, latency="bootstrap:5:30", scale=3, sequences=FEW).to_frame()
+    assert not np.array_equal(plain["auc"], expected["auc"])
+
+
+def test_the_four_rows_of_the_paper(tmp_path: Path) -> None:
+    results = run(
+        tmp_path, Study((str(SLOW),), sequences=FEW, pre_forecaster=("none", "kalman"),
+                        keep_size=True, **FAR),
+    )  # fmt: skip
+    assert len({cell.key for cell in results.plan.cells}) == 4
+    rows = {(row.pre_forecaster, row.forecaster): row for row in results.summary}
+    for name, pre in (("none", {}), ("kalman, size kept", {"keep_size": True})):
+        expected = lae_sim.evaluate(
+            SLOW, latency=FAR["latencies"][0], search="c=0.3", sequences=FEW,
+            pre_forecaster="kalman" if pre else None, **pre,
+        ).summary.set_index("forecaster")  # fmt: skip
+        for forecaster in ("hold", "kalman"):
+            modelled = rows[name, forecaster].modelled
+            assert modelled is not None
+            assert modelled.scores["auc"] == pytest.approx(expected.loc[forecaster, "modelled_auc"])
+    assert rows["none", "hold"].modelled != rows["kalman, size kept", "hold"].modelled
+    for name, said in (
+        ("nobody", "pre_forecaster: no forecaster 'nobody'"),
+        ("tuned-kalman", "pre_forecaster: tuned-kalman must be trained"),
+    ):
+        with pytest.raises(LaeError, match=said):
+            run(tmp_path / "none", pre_forecaster=(name,))
+
+
+def test_a_required_auc_is_that_of_the_ranking(tmp_path: Path) -> None:
+    study = Study(
+        (str(SLOW),), sequences=FEW, forecasters=("hold",), require_auc=Fraction(45, 100),
+        latencies=("constant:90ms",), search=("c=0.3", "off"),
+    )  # fmt: skip
+    modelled, recorded = run(tmp_path, study).required
+    assert (modelled.ranked_by, recorded.ranked_by) == ("modelled", "recorded")
+
+    def auc(scale: Fraction | None, name: str) -> float:
+        found = lae_sim.evaluate(
+            SLOW, latency="constant:90ms", scale=scale, search="c=0.3", sequences=FEW
+        ).summary.query("forecaster == 'hold'")
+        return float(found["auc" if found["exact"].all() else name].iloc[0])
+
+    for one, name in ((modelled, "modelled_auc"), (recorded, "auc")):
+        assert one.auc == pytest.approx(auc(one.scale, name))
+        assert one.beyond_auc == pytest.approx(auc(one.beyond, name))
+    assert modelled.scale is not None
+    assert recorded.scale is not None
+    assert modelled.scale < recorded.scale
 
 
 def test_times_that_belong_to_no_trace_are_refused(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from places import TRACES
+from restarted import gap_pass
 
 from lae_sim.comparison.forecasters import score_forecasters, steps
 from lae_sim.comparison.statistics import summarise
@@ -54,7 +55,7 @@ def values(table: pd.DataFrame, **wanted: Any) -> np.ndarray:
 
 
 def test_columns_and_rows(slow: Trace) -> None:
-    table = score_forecasters({"slow": slow}, FORECASTERS)
+    table = score_forecasters({"slow": slow}, FORECASTERS, [World.of(search="off")])
     assert list(table) == [*KEYS, "value"]
     assert not table.duplicated(KEYS).any()
     assert len(table) == 4 * 4 * 3  # metrics, forecasters with hold and offline, sequences
@@ -71,7 +72,13 @@ def test_every_value_is_what_evaluate_gives(slow: Trace, fast: Trace) -> None:
     scales, sigmas = [Fraction(1, 2), Fraction(2)], [Fraction(0), Fraction(1, 3), Fraction(1)]
     fps, convention = Fraction(25), find_convention("otb")
     worlds = World.sweep(
-        fps=fps, policy=fifo, latency=list(sources), scale=scales, sigma=sigmas, convention="otb"
+        fps=fps,
+        policy=fifo,
+        latency=list(sources),
+        scale=scales,
+        sigma=sigmas,
+        convention="otb",
+        search="off",
     )
     traces = {"slow": slow, "fast": fast}
     table = score_forecasters(traces, FORECASTERS, worlds)
@@ -139,7 +146,7 @@ def test_nothing_is_trained_on_what_it_is_scored_on(slow: Trace, fast: Trace) ->
 
 
 def test_notes_say_what_is_approximate(slow: Trace) -> None:
-    worlds = World.sweep(latency=["constant:1ms", "constant:90ms"])
+    worlds = World.sweep(latency=["constant:1ms", "constant:90ms"], search="off")
     notes = score_forecasters({"slow": slow}, {}, worlds).attrs["notes"]
     assumed = "ms, the same as a frame: an assumption; name it with ,init=TIME"
     assert notes == [
@@ -157,7 +164,7 @@ def test_a_real_time_trace_is_exact_and_has_no_offline_scores() -> None:
     assert np.isfinite(table["value"][table["forecaster"] != "offline"]).all()
     assert not [note for note in table.attrs["notes"] if "approximate" in note]
     every_frame = read_trace(TRACES / "synthetic-slow.parquet", SEQUENCES)
-    again = score_forecasters({"run": every_frame}, FORECASTERS)
+    again = score_forecasters({"run": every_frame}, FORECASTERS, [World(search="off")])
     known = table["forecaster"] != "offline"
     pd.testing.assert_frame_equal(table[known], again[known], check_exact=True)
     with pytest.raises(LaeError, match="the trace has no box for it"):
@@ -248,3 +255,80 @@ def test_nanotrack_on_dtb70(
         np.testing.assert_allclose(found, shares, rtol=0, atol=0.1)
     else:
         assert (found >= shares).all(), found
+
+
+def test_modelled_scores_stand_beside_and_stop_at_exact_replays(slow: Trace) -> None:
+    worlds = World.sweep(latency=["constant:1ms", "constant:90ms"], search="c=0.3")
+    table = score_forecasters({"slow": slow}, FORECASTERS, worlds)
+    modelled = {f"modelled_{m}{end}" for m in ("auc", "dp20") for end in ("", "_low", "_high")}
+    assert set(table["metric"]) == {*METRICS, *modelled}
+    for world in worlds:
+        names = {"hold": Hold, **FORECASTERS}
+        found = evaluate_runs(world.replay(slow), slow.metadata, names).modelled
+        for f, forecaster in enumerate(names):
+            for end, expected in (("", found.mean), ("_low", found.low), ("_high", found.high)):
+                got = values(
+                    table,
+                    latency=world.latency,
+                    forecaster=forecaster,
+                    metric=f"modelled_auc{end}",
+                )
+                np.testing.assert_array_equal(got, expected["auc"][f, :, 0])
+    exact = table[table["latency"] == "constant:1ms"]
+    for name in modelled:
+        recorded = name.split("_")[1]
+        np.testing.assert_array_equal(
+            values(exact, metric=name), values(exact, metric=recorded), name
+        )
+    for row in table.attrs["modelled"]:
+        assert row["latency"] == "constant:90ms"
+        chosen = values(
+            table,
+            latency="constant:90ms",
+            forecaster=row["forecaster"],
+            metric="modelled_auc",
+        )
+        assert row["auc"] == pytest.approx(chosen.mean(), abs=1e-12)
+        assert row["auc_low"] < row["auc"] < row["auc_high"]
+    assert table.attrs["ranking"]["modelled"]
+
+
+def test_passes_find_the_trace_of_their_tracker(slow: Trace, fast: Trace, tmp_path: Path) -> None:
+    gaps = read_trace(gap_pass(slow.metadata, tmp_path / "slow.gaps.parquet"))
+    worlds = [World.of(latency="constant:90ms", passes=[gaps])]
+    table = score_forecasters({"slow": slow, "fast": fast}, {}, worlds)
+    known = {row["trace"]: row["c_known"] for row in table.attrs["search"]}
+    assert known == {"slow": True, "fast": False}
+    assert table.attrs["ranking"] == {
+        "modelled": False,
+        "reason": "the reach is unknown, and the model's are for a range of it",
+    }
+    alone = score_forecasters({"fast": fast}, {}, worlds)  # is asked to take it
+    assert alone.attrs["search"][0]["c_known"]
+    stranger = Trace(Metadata.new("30", "restarts", tracker={"name": "stranger"}), list(gaps))
+    strange = [World.of(passes=[stranger])]
+    with pytest.raises(LaeError, match="a pass is of stranger on unknown: none of the traces"):
+        score_forecasters({"slow": slow, "fast": fast}, {}, strange)
+
+
+def test_what_is_trained_learns_from_the_recorded_boxes(slow: Trace) -> None:
+    class Remembers:
+        def __init__(self) -> None:
+            self.fed: list[np.ndarray] = []
+
+        def fit(self, examples: Examples, seed: int) -> type[Hold]:
+            self.fed.append(examples.lanes.boxes)
+            return Hold
+
+    one, other = Remembers(), Remembers()
+    for trainer, search in ((one, "off"), (other, "c=0.1")):
+        world = World(latency="constant:90ms", search=search)
+        score_forecasters({"slow": slow}, {"spy": trainer}, [world], folds=3)
+    for a, b in zip(one.fed, other.fed, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_worlds_share_their_search_model(slow: Trace) -> None:
+    worlds = [World(search="off"), World(search="c=0.3")]
+    with pytest.raises(LaeError, match="share their passes and their search model"):
+        score_forecasters({"slow": slow}, {}, worlds)

@@ -11,7 +11,8 @@ from places import SHARED, TRACES
 
 import lae_sim
 from lae_sim.evaluation.evaluate import Evaluation, evaluate_groups, evaluate_runs
-from lae_sim.evaluation.modelled import MODELLED, UNEXPLAINED
+from lae_sim.evaluation.modelled import MODELLED, UNEXPLAINED, Ranking, over_sigmas
+from lae_sim.evaluation.totals import ModelledTotals
 from lae_sim.forecast.base import Hold
 from lae_sim.forecast.kalman import Kalman
 from lae_sim.replay.reach import Reach
@@ -174,3 +175,53 @@ def test_the_figures_of_the_prototype(tracker, world, forecaster, expected, tmp_
     result = lae_sim.evaluate(trace, forecasters=forecaster, **world).summary
     row = result[result.forecaster == forecaster].iloc[0]
     assert (row.modelled_auc, row.modelled_dp20) == pytest.approx(expected, abs=0.0006)
+
+
+KNOWN, UNKNOWN, EXACT, SILENT = (True, False), (False, False), (None, True), (None, False)
+
+
+@pytest.mark.parametrize(
+    ("replays", "modelled", "reason"),
+    [
+        ([EXACT], False, ""),
+        ([SILENT, EXACT], False, ""),
+        ([KNOWN], True, "the reach is given or measured"),
+        ([KNOWN, EXACT, (True, True)], True, "the reach is given or measured"),
+        ([KNOWN, UNKNOWN], False, "the reach is unknown, and the model's are for a range of it"),
+        ([KNOWN, SILENT], False, "the search model says nothing of some approximate replays"),
+    ],
+)
+def test_modelled_scores_rank_where_all_of_them_can(replays, modelled, reason):
+    ranking = Ranking.of(iter(replays))
+    assert (ranking.modelled, ranking.reason) == (modelled, reason)
+    assert ranking.by == ("modelled" if modelled else "recorded")
+    assert str(ranking).startswith(
+        "ranked by the " + ("modelled scores" if modelled else "scores of the recorded boxes")
+    )
+    assert str(ranking).endswith(reason)
+
+
+def test_joint_draws_of_means_over_sigma_are_means_of_joint_draws():
+    random = np.random.default_rng(0)
+    means, counts = random.random((2, 7, 5)), np.full((2, 7, 5), 4.0)
+    sums, over = over_sigmas(np.stack([means * counts, counts]))
+    assert over.shape == (2, 7, 1)
+    assert np.allclose(sums / over, means.mean(axis=-1, keepdims=True))
+    counts[0, 0, 2] = 0  # no sequence counts at one sigma
+    sums, over = over_sigmas(np.stack([means * counts, counts]))
+    assert (sums[0, 0], over[0, 0]) == (0, 0)
+    assert over[1:].all()
+
+
+def test_the_interval_over_the_grid_is_inside_those_of_its_sigmas():
+    runs = replace(runs_of("off"), search=MEASURED)
+    totals = ModelledTotals(0)
+    totals.add(evaluated(runs, SIGMA_GRID))
+    each, over = totals.figures(), totals.figures(over_grid=True)
+    for metric in MODELLED:
+        assert np.allclose(over[metric], each[metric].mean(axis=1, keepdims=True))
+        low, high = over[f"{metric}_low"], over[f"{metric}_high"]
+        assert (low < over[metric]).all()
+        assert (over[metric] < high).all()
+        assert (low >= each[f"{metric}_low"].min(axis=1, keepdims=True)).all()
+        assert (high <= each[f"{metric}_high"].max(axis=1, keepdims=True)).all()

@@ -133,7 +133,7 @@ def test_what_is_left_out_is_said(html):
 
 def test_a_study_of_one_trace_and_hold_alone_is_the_same_bytes_twice(tmp_path):
     [path, _] = nasty_traces(tmp_path)
-    study = Study((path,), forecasters=("hold",), attributes=False)
+    study = Study((path,), forecasters=("hold",), attributes=False, search="off")
     results = compute_study(study, tmp_path / "results", workers=1)
     text = page(View(results))
     ids = [attrs["id"] for _, attrs in Checker(text).found if "id" in attrs]

@@ -100,6 +100,13 @@ def test_a_study_survives_its_document() -> None:
         ),
         ('traces = "a"\nlatencies = ["bootstrap:3,init=1s"]', "in a study the keys seed and"),
         ('traces = "a"\npolicies = ["last"]', "no policy 'last'"),
+        ('traces = "a"\nsearch = "c=x"', "search: no search 'c=x': there are off, trace"),
+        (
+            'traces = "a"\nsearch = ["off", "trace"]\npre_forecaster = "kalman"',
+            "pre_forecaster: what it is worth is the search model's",
+        ),
+        ('traces = "a"\nkeep_size = true', "keep_size: it is a way to use a pre_forecaster"),
+        ('traces = "a"\nkeep_size = 1', "keep_size: 1 is neither true nor false"),
         ('traces = "a"\npolicies = ["vot-realtime"]', "never scores latency"),
         ('traces = "a"\nconventions = ["pysott"]', "no convention 'pysott'"),
         ('traces = "a"\nforecasters = ["offline"]', "offline is the tracker's own score"),

@@ -12,7 +12,7 @@ from places import REPOSITORY
 
 from lae_sim.comparison.statistics import Difference, Interval, Recovered
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.study.records import Failure, Staleness, SummaryRow, Uncertainty
+from lae_sim.study.records import Failure, Modelled, Staleness, SummaryRow, Uncertainty
 from lae_sim.study.run import compute_study, write_csv
 from lae_sim.study.spec import Study
 from lae_sim.study.summary import _front, _median_survival
@@ -32,6 +32,8 @@ def summary_row(**values):
         fps=Fraction(30000, 1001),
         latency="recorded",
         scale=Fraction(3, 2),
+        search="off",
+        pre_forecaster="none",
         convention="pysot",
         forecaster="kalman",
         sequences=3,
@@ -52,7 +54,8 @@ def summary_row(**values):
 
 HEAD = [
     "trace", "tracker", "dataset", "device", "times_from", "policy", "fps", "latency", "scale",
-    "convention", "forecaster", "sequences", "repetitions", "engine", "exact",
+    "search", "pre_forecaster", "convention", "forecaster", "sequences", "repetitions", "engine",
+    "exact",
     "approximate_share", "elapsed_ms", "init_ms", "init_source", "skip_rate", "sigma",
     "auc", "dp20", "offline_auc", "offline_dp20",
 ]  # fmt: skip
@@ -60,7 +63,7 @@ HEAD = [
 
 def test_a_flat_row_has_exact_numbers_as_text_and_no_key_of_what_was_not_asked():
     row = summary_row().flat()
-    assert list(row) == [*HEAD, "pareto"]
+    assert list(row) == [*HEAD, "ranked_by", "pareto"]
     assert (row["fps"], row["scale"], row["sigma"]) == ("30000/1001", "3/2", "1/50")
     assert (row["elapsed_ms"], row["dp20"], row["pareto"]) == (None, None, False)
 
@@ -75,11 +78,34 @@ def test_a_flat_row_has_all_that_is_known_in_order():
         "vs_hold_auc", "vs_hold_auc_low", "vs_hold_auc_high", "vs_hold_auc_p",
         "recovered_auc", "recovered_auc_low", "recovered_auc_high",
         "mismatch_mean", "age_ms", "age_max_ms", "longest_stale_ms",
-        "failed", "time_to_failure_ms", "pareto",
+        "failed", "time_to_failure_ms", "ranked_by", "pareto",
     ]  # fmt: skip
     assert (row["failed"], row["time_to_failure_ms"], row["pareto"]) == (0.5, None, True)
     later = dataclasses.replace(whole, failed=None)
     assert list(later.columns()) == ["mismatch_mean", "age_ms", "age_max_ms", "longest_stale_ms"]
+
+
+def test_what_is_modelled_has_keys_of_its_own():
+    modelled = Modelled(True, 0.25, {"auc": 0.4, "dp20": None}, {"auc": Interval(0.3, 0.45)})
+    uncertainty = {
+        "auc": Uncertainty(Interval(0.45, 0.55)),
+        "modelled_auc": Uncertainty(Interval(0.2, 0.6), recovered=Recovered(0.1, None)),
+    }
+    row = summary_row(modelled=modelled, uncertainty=uncertainty)
+    flat = row.flat()
+    assert list(flat)[len(HEAD) :] == [
+        "auc_low", "auc_high", "modelled_auc_bootstrap_low", "modelled_auc_bootstrap_high",
+        "recovered_modelled_auc", "c_known", "lost_share",
+        "modelled_auc", "modelled_auc_low", "modelled_auc_high", "modelled_dp20",
+        "ranked_by", "pareto",
+    ]  # fmt: skip
+    assert (flat["modelled_auc_low"], flat["modelled_auc_bootstrap_low"]) == (0.3, 0.2)
+    assert (row.score("auc"), row.certainty("auc")) == (0.5, uncertainty["auc"])
+    ranked = dataclasses.replace(row, ranked_by="modelled")
+    assert (ranked.score("auc"), ranked.score("dp20")) == (0.4, None)
+    assert ranked.certainty("auc") == uncertainty["modelled_auc"]
+    exact = summary_row(ranked_by="modelled", uncertainty={"auc": uncertainty["auc"]})
+    assert (exact.score("auc"), exact.certainty("auc")) == (0.5, uncertainty["auc"])
 
 
 @pytest.mark.parametrize(
@@ -134,7 +160,7 @@ def test_a_table_has_a_column_for_every_key_of_any_row(tmp_path):
     interval = {"auc": Uncertainty(Interval(0.25, 0.75))}
     write_csv([summary_row(), summary_row(uncertainty=interval)], tmp_path / "a.csv")
     header, first, second = (tmp_path / "a.csv").read_text().splitlines()
-    assert header.split(",") == [*HEAD, "pareto", "auc_low", "auc_high"]
+    assert header.split(",") == [*HEAD, "ranked_by", "pareto", "auc_low", "auc_high"]
     assert first.endswith(",False,,")
     assert second.endswith(",False,0.25,0.75")
 
