@@ -322,19 +322,28 @@ def fidelity_figure(rows: Sequence[FidelityRow], title: str = "") -> Figure:
         for kind in ("every-frame", "strided", "modelled")
     }
     for kind, colour, marker in (("every-frame", GREY, "o"), ("strided", SKY_BLUE, "s")):
-        _replay_points(recorded, of_kind[kind], kind, colour, marker)
+        label = f"{kind}{_off(of_kind[kind])}"
+        _replay_points(recorded, of_kind[kind], label, colour, marker)
     _diagonal(recorded, "recorded boxes")
     inside = [row for row in of_kind["modelled"] if row.covered]
     outside = [row for row in of_kind["modelled"] if row.covered is False]
     for some, colour in ((inside, BLUE), (outside, VERMILION)):
-        label = "the interval holds the closed loop" if some is inside else "it does not"
+        holds = "holds" if some is inside else "does not hold"
+        label = f"the interval {holds} the closed loop"
         ends = np.array([[row.auc_low, row.auc_high] for row in some], float).reshape(-1, 2)
         at = [row.closed_auc for row in some]
         modelled.vlines(at, *ends.T, color=colour, alpha=0.45, linewidth=1.2)
         _replay_points(modelled, some, label, colour, "o")
-    _diagonal(modelled, "search model, with its interval of 95 %")
+    _diagonal(modelled, f"search model{_off(of_kind['modelled'])}")
     recorded.set_ylabel("AUC of the replay")
     return figure
+
+
+def _off(rows: Sequence[FidelityRow]) -> str:
+    """How far replays are from closed loops, in words."""
+    if not rows:
+        return ""
+    return f": off by {np.mean([abs(row.d_auc) for row in rows]):.3f} on average"
 
 
 def _replay_points(
@@ -342,7 +351,6 @@ def _replay_points(
 ) -> None:
     if not rows:
         return
-    off = np.mean([abs(row.d_auc) for row in rows])
     axes.scatter(
         [row.closed_auc for row in rows],
         [row.auc for row in rows],
@@ -351,7 +359,7 @@ def _replay_points(
         marker=marker,
         alpha=0.8,
         linewidths=0,
-        label=f"{label}: {len(rows)}, off by {off:.3f} on average",
+        label=f"{label} ({len(rows)})",
         zorder=3,
     )
 
