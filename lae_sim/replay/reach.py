@@ -291,4 +291,9 @@ def _restarted(trace: Trace) -> Iterator[tuple[RestartName, Recording]]:
             raise LaeError(
                 f"restart {recording.name!r}: frame {name.gap}, after the gap, was not processed"
             )
+        if (recording.elapsed_ns[1 : name.gap] >= 0).any():
+            raise LaeError(
+                f"restart {recording.name!r}: a frame before {name.gap} was processed, so that was "
+                "not the gap"
+            )
         yield name, recording

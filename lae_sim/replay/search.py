@@ -18,6 +18,7 @@ distinct *outcomes* with their weights.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -27,12 +28,13 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou, search_distance, search_region, search_side
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, explained
 from lae_sim.forecast.base import AnyFactory, Forecaster, ImageSize, factory_for
 from lae_sim.replay.reach import (
     FOUND_IOU,
     OwnJump,
     Reach,
+    Restart,
     fit_reach,
     own_jumps,
     restarts_of,
@@ -57,6 +59,8 @@ _AGAIN = {True: 0.9, False: 0.1}
 """How often a lost target is found when it is in reach again. A tracker that learns learns whatever
 it sees while it is lost; where that mattered in ``benchmarks/census.py``, eleven of fifteen closed
 loops were nearer to never. The weights leave the mean nearly alone, and widen the interval."""
+
+_NUMBER = re.compile(r"([0-9]+\.?[0-9]*|\.[0-9]+|inf)\Z")
 
 _TINY = float(np.finfo(np.float64).tiny)  # side of a box without a size: infinity times 0 is NaN
 _AS_LARGE = (
@@ -102,13 +106,9 @@ def parse_search(text: str) -> str | ReachRange:
 
 
 def _reach(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError as error:
-        raise LaeError(f"{text!r} is no number") from error
-    if not value >= 0:
-        raise LaeError(f"a reach cannot be {text}")
-    return value
+    if not _NUMBER.match(text):
+        raise LaeError(f"{text!r} is no number from 0 on")
+    return float(text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,13 +193,15 @@ class SearchModel:
         """
         if self.pre_forecaster is None:
             return _Walk(answers, resumed)
-        factory = factory_for(self.pre_forecaster, recording)
+        with explained(f"sequence {recording.name!r}: the pre-forecaster"):
+            factory = factory_for(self.pre_forecaster, recording)
 
         def walk(reach: float, again: bool) -> tuple[Floats, Bools, float]:
-            forecaster = factory(answers.boxes[0].tolist(), image_size)
-            return _forecast_walk(
-                frames, answers, resumed, reach, again, forecaster, self.keep_size, image_size
-            )
+            with explained(f"sequence {recording.name!r}: the pre-forecaster"):
+                forecaster = factory(answers.boxes[0].tolist(), image_size)
+                return _forecast_walk(
+                    frames, answers, resumed, reach, again, forecaster, self.keep_size, image_size
+                )
 
         return walk
 
@@ -280,7 +282,7 @@ class _Walk:
             lost = int(near.argmax()) if near.any() else n - k
             source[k : k + lost] = last
             if lost:
-                same_to = min(same_to, float(offset[:lost].min() / self._side[last]))
+                same_to = min(same_to, float(offset[:lost].min()) / float(self._side[last]))
             k, found = k + lost + 1, True
         return self._boxes[source], source != np.arange(n), same_to * (1 - 1e-12)
 
@@ -354,8 +356,9 @@ def _resumed(recording: Recording, frames: Ints, jumps: Sequence[OwnJump]) -> tu
 
 
 def _recorded(recording: Recording, jump: OwnJump) -> bool:
-    """Whether the recording has a box of the frame after the jump."""
-    return len(jump.frames) > 0 and bool(np.isfinite(recording.boxes[jump.gap]).all())
+    """Whether the recording has the frames of the jump, and a box of the one after it."""
+    inside = len(jump.frames) > 0 and jump.frames[-1] < len(recording)
+    return bool(inside and np.isfinite(recording.boxes[jump.gap]).all())
 
 
 def _outcome(recording: Recording, jump: OwnJump) -> tuple[float, int | None]:
@@ -408,22 +411,30 @@ def find_search(
         low, high, known = asked.low, asked.high, asked.low == asked.high
         source = f"c = {low:g}" + ("" if known else f" to {high:g}") + ", as given"
     else:
-        gaps = tuple(gaps)
+        restarts: dict[tuple[str, str, int, int], Restart] = {}
+        others: dict[str, None] = {}
         for trace in gaps:
-            for name, own in own_jumps(trace).items():
-                jumps.setdefault(name, []).extend(own)
-        reach = fit_reach(restart for trace in gaps for restart in restarts_of(trace))
+            of = trace.metadata
+            if not metadata.goes_with(of):
+                others[f" of {of.tracker} on {of.dataset}"] = None
+            if metadata.dataset == of.dataset or "unknown" in (metadata.dataset, of.dataset):
+                for name, own in own_jumps(trace).items():
+                    jumps.setdefault(name, []).extend(own)
+            for each in restarts_of(trace):  # which count once, if two passes made them
+                restarts[of.dataset, each.sequence, each.start, each.gap] = each
+        reach = fit_reach(restarts.values())
+        measured = f"{len(restarts):,} restarts" + " and".join(others)
         if reach is not None:
             known = True
             source = (
-                f"c = {reach.centre:.2f}, spread {reach.spread:.2f}, measured by "
-                f"{reach.restarts:,} restarts"
+                f"c = {reach.centre:.2f}, spread {reach.spread:.2f}, measured by {measured}"
             )
         else:
             declared = metadata.search
             side = 1.0 if declared is None else declared.half_side
             low, high = (each * side for each in UNKNOWN_REACH)
-            source = f"c is unknown, {low:g} to {high:g} assumed"
+            why = f" ({measured} do not show it)" if jumps or restarts else ""
+            source = f"c is unknown{why}, {low:g} to {high:g} assumed"
     if reach is not None:
         reaches = reach.quantiles(DRAWS)
     elif known:

@@ -188,6 +188,7 @@ def test_own_jumps_say_what_happened_on_each_followed_frame():
         (gap_pass(restart("car", [NONE], [[1, 2, 3, 4]])), "'car'.*SEQUENCE@START"),
         (gap_pass(restart("car@0+1", [NONE], [[1, 2, 3, 4]])), "'car@0.1'.*frame 1"),
         (gap_pass(restart("car@0+1", [NONE] * 2, [[1, 2, 3, 4], NONE])), "'car@0.1'.*frame 1"),
+        (gap_pass(restart("car@0+2", [NONE] * 3, [[1, 2, 3, 4]] * 3)), "'car@0.2'.*before 2"),
     ],
 )
 def test_what_is_no_gap_pass_is_said_to_be_none(trace, words):

@@ -277,6 +277,26 @@ def test_passes_widen_what_is_likely_and_the_replayed_boxes_keep_half_the_weight
         assert min(offs) < np.abs(run.boxes - closed).max() + 1e-9
 
 
+class Raising(Kalman):
+    def predict(self, frame):
+        raise ValueError("no idea")
+
+
+class Short(Kalman):
+    def predict(self, frame):
+        return [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("factory", "words"), [(Raising, "ValueError: no idea"), (Short, "ValueError.*4")]
+)
+def test_a_pre_forecaster_that_fails_is_told_with_its_sequence(factory, words):
+    recording, frames = straight(), np.array([0, 5, 6])
+    ahead = model(0.5, pre_forecaster=factory)
+    with pytest.raises(LaeError, match=f"sequence 'a': the pre-forecaster: {words}"):
+        ahead.outcomes(recording, frames, recorded(recording, frames))
+
+
 # ---------------------------------------------------------------------------------- own jumps
 
 
@@ -335,6 +355,68 @@ def test_jumps_to_frames_without_a_recorded_box_say_nothing():
     assert np.array_equal(found.boxes[0], recording.boxes[frames])
 
 
+def test_jumps_beyond_the_end_of_a_recording_say_nothing():
+    recording = straight(25)
+    frames = np.array([0, 21, 22])
+    jumps = {"a": [jump(straight(), gap, None) for gap in (20, 40)]}
+    found = model(50, jumps=jumps).outcomes(recording, frames, recorded(recording, frames))
+    assert np.array_equal(found.boxes[0], recording.boxes[frames])
+
+
+def test_boxes_without_a_size_are_in_reach_of_nothing():
+    recording = straight()
+    recording.boxes[:, 2:] = 0
+    frames = np.array([0, 5, 6])
+    found = model(0.5, 50).outcomes(recording, frames, recorded(recording, frames))
+    assert np.array_equal(found.boxes[0], recording.boxes[[0, 0, 0]])
+
+
+# ----------------------------------------------------------------------------------- gap passes
+
+
+def restarts(tracker, dataset, count=40, start=1):
+    """A gap pass in which targets that moved by less than .5 search sides are found."""
+    made = []
+    for k, distance in enumerate(np.linspace(0, 1, count)):
+        box = np.array([100.0, 100, 40, 40])
+        then = box + [80 * distance, 0, 0, 0]
+        answers = np.array([box, then if distance < 0.5 else then + 500])
+        made.append(Recording.new(f"s{k:03}@{start}+1", [box, then], answers, [10**6] * 2))
+    about = {"tracker": {"name": tracker}, "dataset": {"name": dataset}}
+    return Trace(Metadata.new("30", "restarts", **about), made)
+
+
+def test_gap_passes_of_another_tracker_or_dataset_are_said_to_be():
+    about = {"tracker": {"name": "mine"}, "dataset": {"name": "here"}}
+    metadata = Metadata.new("30", "every-frame", **about)
+    assert find_search("trace", metadata, [restarts("mine", "here")]).source.endswith("40 restarts")
+    for tracker, dataset in (("other", "here"), ("mine", "there")):
+        found = find_search("trace", metadata, [restarts(tracker, dataset)])
+        assert found.source.endswith(f"40 restarts of {tracker} on {dataset}")
+
+
+def test_a_sequence_of_another_dataset_is_another_sequence():
+    about = {"tracker": {"name": "mine"}, "dataset": {"name": "here"}}
+    metadata = Metadata.new("30", "every-frame", **about)
+    for dataset, own in (("here", 40), ("there", 0), ("unknown", 40)):
+        found = find_search("trace", metadata, [restarts("mine", dataset, start=0)])
+        assert (found.reach.restarts, len(found.jumps)) == (40, own)
+
+
+def test_a_restart_that_two_passes_made_counts_once():
+    one = restarts("mine", "here")
+    found = find_search("trace", one.metadata, [one, restarts("mine", "here")])
+    assert found.reach == find_search("trace", one.metadata, [one]).reach
+
+
+def test_gap_passes_that_show_no_reach_are_said_to_show_none():
+    few = restarts("mine", "here", count=5)
+    found = find_search("trace", few.metadata, [few])
+    assert not found.known
+    assert found.source == "c is unknown (5 restarts do not show it), 0.6 to 1 assumed"
+    assert find_search("trace", EVERY).source == "c is unknown, 0.6 to 1 assumed"
+
+
 # ------------------------------------------------------------------------------- what is asked for
 
 
@@ -380,7 +462,7 @@ def test_a_trace_that_was_recorded_with_a_pre_forecaster():
         find_search("c=0.7", metadata, pre_forecaster=Kalman)
 
 
-@pytest.mark.parametrize("text", ["c", "c=", "c=x", "c=-1", "c=nan", "c=2-1", "d=1", "on", ""])
+@pytest.mark.parametrize("text", ["c", "c=", "c=x", "c=-1", "c=nan", "c=2-1", "d=1", "on", "", "c=0_7", "c= 1", "c=٣"])
 def test_what_is_no_search(text):
     with pytest.raises(LaeError, match=r"no search .*there are off, trace, c=0\.7"):
         parse_search(text)
