@@ -241,7 +241,7 @@ def _print_summary(traces: Sequence[PassSummary]) -> None:
     first, *others = traces
     kind = first.schedule["kind"]
     strided = [each for each in others if "stride" in each.schedule]
-    gaps = [each for each in others if each.schedule["kind"] == "restarts"]
+    gaps = [each for each in traces if each.schedule["kind"] == "restarts"]
     closed = [each for each in others if each.schedule["kind"] == "real-time" != kind]
 
     def named(option: str, passes: Sequence[PassSummary]) -> str:
@@ -250,9 +250,10 @@ def _print_summary(traces: Sequence[PassSummary]) -> None:
 
     path, strides = shlex.quote(first.trace), named("--strided", strided + gaps)
     print("\nnext:")
-    print(f"  lae-sim replay {path}{strides}")
-    if closed:
-        print(f"  lae-sim fidelity {path}{strides}{named('--closed-loop', closed)}")
-    print(f"  lae-sim show {path}")
+    if first not in gaps:  # which are all that is left where every sequence of the others failed
+        print(f"  lae-sim replay {path}{strides}")
+        if closed:
+            print(f"  lae-sim fidelity {path}{strides}{named('--closed-loop', closed)}")
+        print(f"  lae-sim show {path}")
     for each in gaps:
         print(f"  lae-sim show {shlex.quote(each.trace)} --plot reach.png")

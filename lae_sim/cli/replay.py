@@ -40,6 +40,8 @@ examples:
   lae-sim replay trace.parquet --latency constant:47ms --forecaster hold kalman --sigma-grid
   lae-sim replay desktop.parquet --timing jetson.parquet      boxes of one device, times of another
   lae-sim replay trace.parquet --fps 15 30 60 --latency-scale 1/2 1 2 --plot sweep.png
+  lae-sim replay trace.parquet --latency constant:47ms,init=800ms --strided trace.gaps.parquet
+  lae-sim replay trace.parquet --latency constant:47ms --search c=0.7 --pre-forecaster kalman
   lae-sim replay a.parquet b.parquet --latency-scale 2 --json | jq '.traces[].results[].auc'
   lae-sim replay trace.parquet --forecaster my_package.my_module:MyForecaster --per-sequence
 

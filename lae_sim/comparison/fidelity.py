@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lae_sim._arrays import Floats
 from lae_sim.boxes import PARTED_IOU, iou
@@ -264,8 +266,11 @@ def _with_passes(paths: Sequence[str], passes: Sequence[str]) -> list[_Replayed]
     """
     replayed = [_Replayed(path, held(read_trace(path))) for path in paths]
     opened = [(path, held(read_trace(path))) for path in passes]
-    kinds = [each.trace.metadata.kind for each in replayed]
-    if set(kinds) != {"every-frame"} or any(t.metadata.kind == "real-time" for _, t in opened):
+    for each in replayed:
+        if each.trace.metadata.kind == "restarts":
+            raise LaeError(f"{each.path}: a gap pass goes to --strided, beside TRACE")
+    kinds = {each.metadata.kind for each in (*(r.trace for r in replayed), *(t for _, t in opened))}
+    if "real-time" in kinds:
         raise LaeError("TRACE and --strided take traces of every frame, not real-time ones")
     for path, trace in opened:
         mine = [
@@ -301,7 +306,7 @@ def _replayed_for(path: str, closed: Trace, replayed: Sequence[_Replayed]) -> _R
     """
     if closed.metadata.kind != "real-time":
         raise LaeError(
-            f"{path}: a trace of every frame is no closed loop: give one that "
+            f"{path}: a trace of kind {closed.metadata.kind} is no closed loop: give one that "
             "'lae-sim profile --closed-loop' or '--mode real-time' left"
         )
     found = list(replayed)
@@ -525,21 +530,28 @@ def _summary(
         forecaster=forecaster,
         replay=replay,
         sequences=len(rows),
-        closed_auc=float(np.nanmean([row.closed_auc for row in rows])),
-        auc=float(np.nanmean([row.auc for row in rows])),
-        mean_abs_d_auc=float(np.nanmean(d_auc)),
-        median_abs_d_auc=float(np.nanmedian(d_auc)),
-        max_abs_d_auc=float(np.nanmax(d_auc)),
-        closed_dp20=float(np.nanmean([row.closed_dp20 for row in rows])),
-        dp20=float(np.nanmean([row.dp20 for row in rows])),
-        mean_abs_d_dp20=float(np.nanmean(d_dp20)),
-        median_abs_d_dp20=float(np.nanmedian(d_dp20)),
-        max_abs_d_dp20=float(np.nanmax(d_dp20)),
+        closed_auc=_known(np.mean, [row.closed_auc for row in rows]),
+        auc=_known(np.mean, [row.auc for row in rows]),
+        mean_abs_d_auc=_known(np.mean, d_auc),
+        median_abs_d_auc=_known(np.median, d_auc),
+        max_abs_d_auc=_known(np.max, d_auc),
+        closed_dp20=_known(np.mean, [row.closed_dp20 for row in rows]),
+        dp20=_known(np.mean, [row.dp20 for row in rows]),
+        mean_abs_d_dp20=_known(np.mean, d_dp20),
+        median_abs_d_dp20=_known(np.median, d_dp20),
+        max_abs_d_dp20=_known(np.max, d_dp20),
         covered=_mean(row.covered for row in rows),
         covered_dp20=_mean(row.covered_dp20 for row in rows),
         width_auc=_mean(_width(row.auc_low, row.auc_high) for row in rows),
         width_dp20=_mean(_width(row.dp20_low, row.dp20_high) for row in rows),
     )
+
+
+def _known(how: Callable[[Floats], Any], values: npt.ArrayLike) -> float:
+    """The mean, the median or the largest of the values that are known; NaN if none is."""
+    scores = np.asarray(values, np.float64)
+    scores = scores[~np.isnan(scores)]
+    return float(how(scores)) if len(scores) else np.nan
 
 
 def _width(low: float | None, high: float | None) -> float | None:

@@ -137,9 +137,9 @@ def split_init(text: str, path: bool = False) -> tuple[str, int | None]:
     try:
         return name, parse_duration(value)
     except LaeError as error:
-        raise LaeError(f"{text!r}: init={value}: write a time of 0 or more, as init=800ms") from (
-            error
-        )
+        raise LaeError(
+            f"{text!r}: init={value}: write a time of 0 or more with its unit, as init=800ms"
+        ) from error
 
 
 def duration_ns(duration: str | None, ns: int | None) -> int:

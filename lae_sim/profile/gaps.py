@@ -235,7 +235,7 @@ class Gaps:
         self._use(plan, time.monotonic() + self._budget_s, decided["own_s"])
         if not any(all_of_it):
             self._notice("gaps: no restarts, since too few frames have a truth with a size")
-        elif plan != GapPlan():
+        elif (self._own, self._picked) != all_of_it:
             took = f"an initialisation takes {decided['init_s']:.2g} s here"
             self._notice(
                 f"gaps: {took}, a call {decided['call_s']:.2g} s: within {self._budget_s:g} s "
@@ -323,8 +323,10 @@ class Gaps:
         for sequence in (self._sequences[place] for place in places):
             for start in own_starts(sequence, OWN_GAPS[:1]):
                 live = self._live(start, sequence, sequence.read)
+                with suppress(Exception):  # which is told when it comes again; this one too
+                    sequence.read(0)  # the first time, a video is opened or a scene drawn
                 began = time.monotonic()
-                with suppress(LaeError):  # which is told when it comes again
+                with suppress(LaeError):
                     live(0)
                     initialised = time.monotonic()
                     live(start.name.gap)

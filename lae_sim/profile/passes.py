@@ -14,7 +14,7 @@ import numpy as np
 from lae_sim.datasets.frames import Buffered, Dataset, ImageSequence
 from lae_sim.engine.clock import Clock, parse_duration, split_init
 from lae_sim.engine.scheduler import Service
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, TraceError
 from lae_sim.profile.device import describe_device, readings, source_version
 from lae_sim.profile.journal import Journal
 from lae_sim.profile.live import Live, LiveRun
@@ -156,6 +156,10 @@ def base_document(
     """
     described = dict(tracker.describe())
     measured = {k: described.pop(k) for k in ("synchronised", "threads") if k in described}
+    try:
+        Metadata.new(1, "every-frame", tracker=described)
+    except TraceError as error:
+        raise LaeError(f"{name}: what describe() says does not fit a trace: {error}") from error
     return {
         "format": FORMAT,
         "fps": str(clock.fps),

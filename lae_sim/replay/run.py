@@ -238,9 +238,9 @@ class Runs:
         search: the model of where the tracker finds its target; None for none.
 
     Raises:
-        LaeError: if two passes have the same stride, or the trace is a gap pass; while one goes
-            through the runs, if a sequence or frame that is asked for is not there, or policy or
-            source raise something.
+        LaeError: if two passes have the same stride, or the trace or that of the times is a gap
+            pass; while one goes through the runs, if a sequence or frame that is asked for is not
+            there, or policy or source raise something.
 
     Example:
         >>> import lae_sim
@@ -266,6 +266,8 @@ class Runs:
                 f"{self.trace!r} is a gap pass, which measures a tracker's reach: "
                 "give it to --strided (passes) of a trace of every frame"
             )
+        if self.times.metadata.kind == "restarts":
+            raise LaeError("a gap pass has no times for a replay: take those of another trace")
         strides = [trace.metadata.stride for trace in (self.trace, *self.strided)]
         if self.strided and len(set(strides)) != len(strides):
             raise LaeError("two of the passes have the same stride: give each stride once")

@@ -423,17 +423,15 @@ def find_search(
             for each in restarts_of(trace):  # which count once, if two passes made them
                 restarts[of.dataset, each.sequence, each.start, each.gap] = each
         reach = fit_reach(restarts.values())
-        measured = f"{len(restarts):,} restarts" + " and".join(others)
+        measured = f"{len(restarts):,} restart{'s' * (len(restarts) != 1)}" + " and".join(others)
         if reach is not None:
             known = True
-            source = (
-                f"c = {reach.centre:.2f}, spread {reach.spread:.2f}, measured by {measured}"
-            )
+            source = f"c = {reach.centre:.2f}, spread {reach.spread:.2f}, measured by {measured}"
         else:
             declared = metadata.search
             side = 1.0 if declared is None else declared.half_side
             low, high = (each * side for each in UNKNOWN_REACH)
-            why = f" ({measured} do not show it)" if jumps or restarts else ""
+            why = f" (not shown by {measured})" if jumps or restarts else ""
             source = f"c is unknown{why}, {low:g} to {high:g} assumed"
     if reach is not None:
         reaches = reach.quantiles(DRAWS)

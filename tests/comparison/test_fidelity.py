@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from restarted import gap_pass
 
 from lae_sim.comparison.fidelity import (
     FidelityRow,
@@ -23,7 +24,7 @@ from lae_sim.engine.scheduler import simulate
 from lae_sim.errors import LaeError
 from lae_sim.forecast.kalman import Kalman
 from lae_sim.replay.world import parse_policy
-from lae_sim.trace.file import Trace, write_trace
+from lae_sim.trace.file import Trace, read_trace, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
@@ -210,8 +211,12 @@ def test_traces_that_do_not_go_together_are_told(tmp_path: Path) -> None:
     ):
         with pytest.raises(LaeError, match=message):
             compare_closed_loops(traces, [closed], passes=passes)
-    with pytest.raises(LaeError, match="no closed loop"):
-        compare_closed_loops(every, [every])
+    gaps = str(gap_pass(read_trace(every).metadata, tmp_path / "g.parquet"))
+    for path, kind in ((every, "every-frame"), (gaps, "restarts")):
+        with pytest.raises(LaeError, match=f"of kind {kind} is no closed loop"):
+            compare_closed_loops(every, [path])
+    with pytest.raises(LaeError, match="g.parquet: a gap pass goes to --strided"):
+        compare_closed_loops(gaps, [closed])
 
 
 def test_closed_loops_of_like_times_are_of_one_setting(tmp_path: Path) -> None:
@@ -255,3 +260,6 @@ def test_a_sequence_without_a_score_is_in_no_mean(tmp_path: Path) -> None:
     assert summary.mean_abs_d_auc == abs(row.d_auc)
     assert summary.covered is None
     assert not isnan(summary.auc)
+    (summary,) = summarise_replays([unknown])  # without a warning
+    assert isnan(summary.auc)
+    assert isnan(summary.max_abs_d_auc)

@@ -154,7 +154,7 @@ def test_only_paths_hold_commas_of_their_own() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("constant:47ms,init=", "init=: write a time of 0 or more, as init=800ms"),
+        ("constant:47ms,init=", "init=: write a time of 0 or more with its unit, as init=800ms"),
         ("constant:47ms,init=-1s", "init=-1s: write a time of 0 or more"),
         ("constant:47ms,init=800", "init=800: write a time of 0 or more"),
         ("constant:47ms,init=1s,init=2s", "init stands twice"),

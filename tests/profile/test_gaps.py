@@ -251,6 +251,35 @@ def test_a_budget_makes_fewer_and_says_so(tmp_path: Path) -> None:
     assert "of 1,000 restarts" in notice
 
 
+def test_what_only_the_first_frame_takes_is_not_counted_again_and_again(tmp_path: Path) -> None:
+    slow: set[str] = set()
+
+    def opened(name: str) -> ImageSequence:
+        made = wandering(name)
+
+        def read(frame: int) -> Image:
+            if name not in slow:
+                slow.add(name)
+                time.sleep(0.3)
+            return made.read(frame)
+
+        return ImageSequence(name, made.truth, read)
+
+    data = Dataset("d", Fraction(30), [opened("a"), opened("b")])
+    trace, _, _ = gap_pass(tmp_path, data, Reaching([0.7]), budget="4s")
+    assert trace.metadata.document["schedule"]["restarts"] > 100
+
+
+def test_all_that_there_are_is_not_fewer(tmp_path: Path) -> None:
+    gentle = ImageSequence("s", np.tile([10.0, 10, 12, 10], (8, 1)), wandering("a").read)
+    notices: list[str] = []
+    data, options = Dataset("d", Fraction(30), [gentle]), {"tracker": FakeTimed()}
+    gaps = Gaps(data, options, 10**8, None, notices.append)
+    gaps.prepare(Journal(tmp_path / "t.unfinished", {}, resume=False))
+    assert gaps.calls(gentle) > 0
+    assert notices == []
+
+
 def test_the_rest_is_left_out_when_the_tracker_becomes_slow(tmp_path: Path) -> None:
     class Slower(Reaching):
         def init(self, frame: Image, box: Sequence[float]) -> Answer:

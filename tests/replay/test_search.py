@@ -413,7 +413,7 @@ def test_gap_passes_that_show_no_reach_are_said_to_show_none():
     few = restarts("mine", "here", count=5)
     found = find_search("trace", few.metadata, [few])
     assert not found.known
-    assert found.source == "c is unknown (5 restarts do not show it), 0.6 to 1 assumed"
+    assert found.source == "c is unknown (not shown by 5 restarts), 0.6 to 1 assumed"
     assert find_search("trace", EVERY).source == "c is unknown, 0.6 to 1 assumed"
 
 
@@ -462,7 +462,9 @@ def test_a_trace_that_was_recorded_with_a_pre_forecaster():
         find_search("c=0.7", metadata, pre_forecaster=Kalman)
 
 
-@pytest.mark.parametrize("text", ["c", "c=", "c=x", "c=-1", "c=nan", "c=2-1", "d=1", "on", "", "c=0_7", "c= 1", "c=٣"])
+@pytest.mark.parametrize(
+    "text", ["c", "c=", "c=x", "c=-1", "c=nan", "c=2-1", "d=1", "on", "", "c=0_7", "c= 1", "c=٣"]
+)
 def test_what_is_no_search(text):
     with pytest.raises(LaeError, match=r"no search .*there are off, trace, c=0\.7"):
         parse_search(text)
