@@ -238,9 +238,9 @@ class Runs:
         search: the model of where the tracker finds its target; None for none.
 
     Raises:
-        LaeError: if two passes have the same stride, or the trace or that of the times is a gap
-            pass; while one goes through the runs, if a sequence or frame that is asked for is not
-            there, or policy or source raise something.
+        LaeError: if two passes have the same stride or one is a real-time trace, or the trace or
+            that of the times is a gap pass; while one goes through the runs, if a sequence or frame
+            that is asked for is not there, or policy or source raise something.
 
     Example:
         >>> import lae_sim
@@ -268,6 +268,8 @@ class Runs:
             )
         if self.times.metadata.kind == "restarts":
             raise LaeError("a gap pass has no times for a replay: take those of another trace")
+        if any(trace.metadata.kind == "real-time" for trace in self.strided):
+            raise LaeError("a real-time trace is no pass: it lacks the frames that were skipped")
         strides = [trace.metadata.stride for trace in (self.trace, *self.strided)]
         if self.strided and len(set(strides)) != len(strides):
             raise LaeError("two of the passes have the same stride: give each stride once")

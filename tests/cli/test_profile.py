@@ -441,6 +441,12 @@ def test_a_gap_pass_goes_beside_the_other_passes(here: Path) -> None:
         assert err.count("\n") == 1
         assert "is a gap pass" in err
         assert "--strided" in err
+    for option, pass_, message in (
+        ("--timing", "t.gaps.parquet", "a gap pass has no times"),
+        ("--strided", "t.closed-loop-47ms.parquet", "a real-time trace is no pass"),
+    ):
+        _, err = ran(here, "replay", "t.parquet", option, pass_, status=2)
+        assert message in err
 
     said, _ = ran(here, "show", "t.gaps.parquet")
     assert "reach        centre" in said
@@ -458,9 +464,17 @@ def test_a_gap_pass_goes_beside_the_other_passes(here: Path) -> None:
     assert "one by one" in err
 
 
+def test_where_only_restarts_are_left_they_are_what_comes_next(here: Path) -> None:
+    bad = ("--option", "fail_at=20", "--sequence", "bad", "--out", "t.parquet")  # of 23 calls
+    out, _ = profile(here, *MINE, *bad, "--gaps", status=1)
+    assert not (here / "t.parquet").exists()
+    assert out.partition("next:\n")[2] == "  lae-sim show t.gaps.parquet --plot reach.png\n"
+
+
 def test_a_tracker_that_declares_no_search_region(here: Path) -> None:
     text = TRACKERS.replace('"version": "1",', '"version": "1", "search": {"half_side": "big"},')
     (here / "mine.py").write_text(text)
     _, err = profile(here, *MINE, status=2)
+    assert "mine:Bright: what describe() says does not fit a trace" in err
     assert "tracker.search.half_side" in err
     assert "such as 1.0" in err

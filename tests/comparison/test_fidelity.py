@@ -215,7 +215,7 @@ def test_traces_that_do_not_go_together_are_told(tmp_path: Path) -> None:
     for path, kind in ((every, "every-frame"), (gaps, "restarts")):
         with pytest.raises(LaeError, match=f"of kind {kind} is no closed loop"):
             compare_closed_loops(every, [path])
-    with pytest.raises(LaeError, match="g.parquet: a gap pass goes to --strided"):
+    with pytest.raises(LaeError, match=r"g\.parquet: a gap pass goes to --strided"):
         compare_closed_loops(gaps, [closed])
 
 
