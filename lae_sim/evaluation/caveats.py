@@ -109,6 +109,17 @@ def notes_on(
             f"{len(sequences)} sequences that by the next frame the target has left the region "
             f"which a tracker such as SiamFC searches around the initial box: {', '.join(left)}"
         )
+    never = [n for n, i, p in zip(sequences, replay.frames, replay.processed) if p == 1 < i]
+    if never:
+        notes.append(
+            f"no frame after the initialisation ({in_ms(replay.init_ns.mean() / 1e6)}) is "
+            f"processed in {len(never)} of {len(sequences)} sequences, such as {never[0]!r}"
+        )
+    forecaster = metadata.document["schedule"].get("pre_forecaster")
+    if forecaster is not None and replay.departures.any():
+        notes.append(
+            f"recorded with the pre-forecaster {forecaster!r}, so the search model says nothing"
+        )
     unknown = sum(metadata.image_size(name) is None for name in sequences)
     if unknown and "kalman-lae-pvt" in forecasters:
         notes.append(

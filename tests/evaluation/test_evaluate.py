@@ -435,3 +435,27 @@ def test_each_sequence_whose_target_leaves_is_named() -> None:
     [note] = notes_on(found, EVERY, PYSOT, {"hold": Hold})
     assert "initialisation (1,000 ms) ends so late in 3 of 4 sequences" in note
     assert note.endswith(": s1, s2, s3")
+
+
+def test_sequences_of_which_nothing_but_the_first_frame_is_processed_are_told() -> None:
+    long = leaving("long", speed=0)
+    short = replace(
+        long,
+        name="short",
+        **{name: getattr(long, name)[:20] for name in ("truth", "boxes", "elapsed_ns", "score")},
+    )
+    runs = [replay_sequence(each, CLOCK, initialised(by_frame, 10**9)) for each in (long, short)]
+    found = evaluate_runs(runs, EVERY, {"hold": Hold}).replay
+    [note] = notes_on(found, EVERY, PYSOT, {"hold": Hold})
+    assert "after the initialisation (1,000 ms) is processed in 1 of 2 sequences" in note
+    assert note.endswith("such as 'short'")
+
+
+def test_what_was_recorded_with_a_pre_forecaster_is_said_to_have_no_model() -> None:
+    schedule = {"pre_forecaster": "kalman"}
+    searched = Metadata.new("30", "every-frame", schedule=schedule)
+    for latency, told in ((constant("10ms"), []), (constant("47ms"), ["'kalman'"])):
+        runs = [replay_sequence(leaving("a", speed=0), CLOCK, latency)]
+        found = evaluate_runs(runs, searched, {"hold": Hold}).replay
+        notes = notes_on(found, searched, PYSOT, {"hold": Hold})
+        assert [note.split(",")[0].split()[-1] for note in notes] == told
