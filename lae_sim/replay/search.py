@@ -413,17 +413,21 @@ def find_search(
     else:
         restarts: dict[tuple[str, str, int, int], Restart] = {}
         others: dict[str, None] = {}
+        gaps = tuple(gaps)
         for trace in gaps:
             of = trace.metadata
             if not metadata.goes_with(of):
-                others[f" of {of.tracker} on {of.dataset}"] = None
+                others[f"of {of.tracker} on {of.dataset}"] = None
             if metadata.dataset == of.dataset or "unknown" in (metadata.dataset, of.dataset):
                 for name, own in own_jumps(trace).items():
                     jumps.setdefault(name, []).extend(own)
             for each in restarts_of(trace):  # which count once, if two passes made them
                 restarts[of.dataset, each.sequence, each.start, each.gap] = each
         reach = fit_reach(restarts.values())
-        measured = f"{len(restarts):,} restart{'s' * (len(restarts) != 1)}" + " and".join(others)
+        measured = f"{len(restarts):,} restart{'s' * (len(restarts) != 1)}"
+        if others:
+            mine = any(metadata.goes_with(trace.metadata) for trace in gaps)
+            measured += (", some " if mine else " ") + " and ".join(others)
         if reach is not None:
             known = True
             source = f"c = {reach.centre:.2f}, spread {reach.spread:.2f}, measured by {measured}"

@@ -393,6 +393,10 @@ def test_gap_passes_of_another_tracker_or_dataset_are_said_to_be():
     for tracker, dataset in (("other", "here"), ("mine", "there")):
         found = find_search("trace", metadata, [restarts(tracker, dataset)])
         assert found.source.endswith(f"40 restarts of {tracker} on {dataset}")
+    both = [restarts("mine", "here"), restarts("mine", "there")]
+    assert find_search("trace", metadata, both).source.endswith(
+        "80 restarts, some of mine on there"
+    )
 
 
 def test_a_sequence_of_another_dataset_is_another_sequence():
