@@ -167,7 +167,8 @@ class ProfilePlan:
 
     def settings(self) -> dict[str, str]:
         """The fields as text, for a resumed profile to compare."""
-        return {each.name: str(getattr(self, each.name)) for each in fields(self)}
+        gaps = "none" if self.gaps is None else f"{self.gaps / NS_PER_SECOND:g} s"
+        return {each.name: str(getattr(self, each.name)) for each in fields(self)} | {"gaps": gaps}
 
 
 @dataclass(frozen=True, repr=False)

@@ -22,6 +22,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import lru_cache
 from math import ceil, inf, log
 
 import numpy as np
@@ -405,29 +406,15 @@ def find_search(
     if asked == "off" or searched is not None:  # the model would have to search where that one did
         return None
     reach: Reach | None = None
-    jumps: dict[str, list[OwnJump]] = {}
+    jumps: Mapping[str, Sequence[OwnJump]] = {}
     known, low, high = False, 0.0, 0.0
     if isinstance(asked, ReachRange):
         low, high, known = asked.low, asked.high, asked.low == asked.high
         source = f"c = {low:g}" + ("" if known else f" to {high:g}") + ", as given"
     else:
-        restarts: dict[tuple[str, str, int, int], Restart] = {}
-        others: dict[str, None] = {}
         gaps = tuple(gaps)
-        for trace in gaps:
-            of = trace.metadata
-            if not metadata.goes_with(of):
-                others[f"of {of.tracker} on {of.dataset}"] = None
-            if metadata.dataset == of.dataset or "unknown" in (metadata.dataset, of.dataset):
-                for name, own in own_jumps(trace).items():
-                    jumps.setdefault(name, []).extend(own)
-            for each in restarts_of(trace):  # which count once, if two passes made them
-                restarts[of.dataset, each.sequence, each.start, each.gap] = each
-        reach = fit_reach(restarts.values())
-        measured = f"{len(restarts):,} restart{'s' * (len(restarts) != 1)}"
-        if others:
-            mine = any(metadata.goes_with(trace.metadata) for trace in gaps)
-            measured += (", some " if mine else " ") + " and ".join(others)
+        reach, restarts, jumps = _measured(gaps, metadata.dataset)
+        measured = f"{restarts:,} restart{'s' * (restarts != 1)}{_of_others(gaps, metadata)}"
         if reach is not None:
             known = True
             source = f"c = {reach.centre:.2f}, spread {reach.spread:.2f}, measured by {measured}"
@@ -435,7 +422,7 @@ def find_search(
             declared = metadata.search
             side = 1.0 if declared is None else declared.half_side
             low, high = (each * side for each in UNKNOWN_REACH)
-            why = f" (not shown by {measured})" if jumps or restarts else ""
+            why = f" (not shown by {measured})" if gaps else ""
             source = f"c is unknown{why}, {low:g} to {high:g} assumed"
     if reach is not None:
         reaches = reach.quantiles(DRAWS)
@@ -444,6 +431,36 @@ def find_search(
     else:
         reaches = np.array([low, (low + high) / 2, high])
     return SearchModel(reaches, known, source, reach, jumps, pre_forecaster, keep_size)
+
+
+@lru_cache(maxsize=8)  # a sweep asks in every world
+def _measured(
+    gaps: tuple[Trace, ...], dataset: str
+) -> tuple[Reach | None, int, Mapping[str, Sequence[OwnJump]]]:
+    """The curve that some gap passes show together, of how many restarts, and own jumps.
+
+    A restart that two passes made counts once. Own jumps, by sequence, are those of a dataset: what
+    is called alike in another is another sequence.
+    """
+    jumps: dict[str, list[OwnJump]] = {}
+    restarts: dict[tuple[str, str, int, int], Restart] = {}
+    for trace in gaps:
+        of = trace.metadata.dataset
+        if of == dataset or "unknown" in (of, dataset):
+            for name, own in own_jumps(trace).items():
+                jumps.setdefault(name, []).extend(own)
+        for each in restarts_of(trace):
+            restarts[of, each.sequence, each.start, each.gap] = each
+    return fit_reach(restarts.values()), len(restarts), jumps
+
+
+def _of_others(gaps: Iterable[Trace], metadata: Metadata) -> str:
+    """Of which other trackers and datasets some gap passes are, in words; empty if of none."""
+    all_of = [each.metadata for each in gaps]
+    others = [of for of in all_of if not metadata.goes_with(of)]
+    names = dict.fromkeys(f"of {of.tracker} on {of.dataset}" for of in others)
+    some = ", some" if others and len(others) < len(all_of) else ""
+    return f"{some} {' and '.join(names)}" if others else ""
 
 
 def phase_answers(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -398,6 +399,8 @@ def test_an_interrupted_gap_pass_is_resumed(
     assert "--resume goes on" in notices[-1]
     part = read_trace(tmp_path / "t.gaps.parquet")
     assert {RestartName.parse(name).sequence for name in part.names} == {"a"}
+    with pytest.raises(LaeError, match="with gaps '18000 s', not '60 s'"):
+        run_profile(replace(plan, gaps=parse_budget("1m")), out, resume=True)
     profile = run_profile(plan, out, resume=True)
     whole = read_trace(tmp_path / "t.gaps.parquet")
     assert set(part.names) < set(whole.names)
