@@ -13,6 +13,9 @@ from lae_sim.errors import LaeError
 PARTED_IOU = 0.5
 """Two answers for one frame that overlap less are not of the same place."""
 
+MOST_PIXELS = 1e9
+"""Beyond any image."""
+
 
 def iou(a: Floats, b: Floats) -> Floats:
     """Intersection over union, row by row.
@@ -99,10 +102,11 @@ def search_region(box: Sequence[float], image_size: tuple[int, int] | None) -> l
         image_size: width and height in pixels; None if unknown, and then nothing is too far out.
 
     Raises:
-        LaeError: if the box is not finite.
+        LaeError: if the box is not finite, or beyond any image where the image's size is unknown.
     """
     x, y, w, h = (float(value) for value in box)
-    if not all(map(isfinite, (x, y, w, h))):
+    beyond = image_size is None and max(map(abs, (x, y, w, h))) > MOST_PIXELS
+    if beyond or not all(map(isfinite, (x, y, w, h))):
         raise LaeError(f"the pre-forecaster predicted {x:g}, {y:g}, {w:g}, {h:g}, not a box")
     centre_x, centre_y = x + w / 2, y + h / 2
     w, h = max(w, 1.0), max(h, 1.0)

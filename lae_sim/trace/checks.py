@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.boxes import iou
+from lae_sim.boxes import MOST_PIXELS, iou
 from lae_sim.errors import TraceError
 from lae_sim.trace.columns import BOX, TRUTH, Rows
 from lae_sim.trace.restarts import is_restart
@@ -21,7 +21,6 @@ COLUMN_TYPES = {
     "score": "float",
 }
 OPTIONAL = (*TRUTH, "score")
-MOST_PIXELS = 1e9
 # No known tracker does 5,000 frames/s, so a shorter typical time is in another unit.
 _LEAST_TYPICAL_NS = 200_000
 _SAMPLE_ROWS = 10_000  # of each batch, to tell boxes from corners

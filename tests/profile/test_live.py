@@ -355,8 +355,10 @@ def test_any_forecaster_may_be_the_pre_forecaster_and_is_new_in_each_pass(factor
 def test_a_search_stays_within_the_image() -> None:
     assert search_region([10, 20, 4, 6], (96, 64)) == [12, 23, 4, 6]
     assert search_region([-50, 100, -3, 5000], (96, 64)) == [0, 64, 1, 64]
-    with pytest.raises(LaeError, match="pre-forecaster"):
-        search_region([np.nan, 0, 1, 1], (96, 64))
+    assert search_region([1e200, 0, 1, 1e200], (96, 64)) == [96, 64, 1, 64]
+    for box, size in (([np.nan, 0, 1, 1], (96, 64)), ([1e200, 0, 1, 1], None)):
+        with pytest.raises(LaeError, match="pre-forecaster"):
+            search_region(box, size)
 
 
 @given(stride=st.sampled_from([2, 3]), at=st.integers(1, 3))
