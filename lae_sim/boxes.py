@@ -57,12 +57,12 @@ def search_side(boxes: Floats) -> Floats:
     Siamese Networks for Object Tracking", 2016, sec. 2.2).
 
     Args:
-        boxes: float64 [..., 4].
+        boxes: float64 [..., 4]; a size below 0 counts as none.
 
     Returns:
         float64 [...]; NaN where the box is.
     """
-    w, h = boxes[..., 2], boxes[..., 3]
+    w, h = (np.maximum(boxes[..., side], 0.0) for side in (2, 3))
     context = (w + h) / 2
     side: Floats = np.sqrt((w + context) * (h + context))
     return side

@@ -157,7 +157,9 @@ class _Job:
                 parted |= iou(_boxes(passes[other], frames), boxes) < PARTED_IOU
             disagreement = float(parted.mean())
         run = Run(self.recording, schedule, boxes, departures, disagreement)
-        if self.search is None or not (departures or self.search.pre_forecaster is not None):
+        if self.search is None or len(frames) == 1:
+            return run
+        if not departures and self.search.pre_forecaster is None:
             return run
         farther = np.append(False, np.diff(frames) > (frames - before.take(frames))[1:])
         recorded = [RecordedAnswers(boxes, farther)]

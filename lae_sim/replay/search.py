@@ -58,10 +58,8 @@ _AGAIN = {True: 0.9, False: 0.1}
 it sees while it is lost; where that mattered in ``benchmarks/census.py``, eleven of fifteen closed
 loops were nearer to never. The weights leave the mean nearly alone, and widen the interval."""
 
-_TINY = float(np.finfo(np.float64).tiny)  # side of a box without a size: infinity times 0 is NaN
-_AS_LARGE = (
-    0.25  # log of the ratio of two gaps, up to which the outcome of one says that of the other
-)
+_LEAST_SIDE = 1e-9  # pixels; of a box without a size, since infinity times 0 is NaN
+_AS_LARGE = 0.25  # log of the ratio of two gaps up to which one says what comes of the other
 
 
 @dataclass(frozen=True)
@@ -254,7 +252,7 @@ class _Walk:
     def __init__(self, answers: RecordedAnswers, resumed: tuple[int, bool]) -> None:
         self._boxes, self._farther = answers.boxes, answers.farther
         self._middle = answers.boxes[:, :2] + answers.boxes[:, 2:] / 2
-        self._side = np.maximum(search_side(answers.boxes), _TINY)
+        self._side = np.maximum(search_side(answers.boxes), _LEAST_SIDE)
         self._offset = np.abs(np.diff(self._middle, axis=0)).max(axis=1, initial=0.0)
         self._resumed = resumed
 
@@ -354,8 +352,10 @@ def _resumed(recording: Recording, frames: Ints, jumps: Sequence[OwnJump]) -> tu
 
 
 def _recorded(recording: Recording, jump: OwnJump) -> bool:
-    """Whether the recording has a box of the frame after the jump."""
-    return len(jump.frames) > 0 and bool(np.isfinite(recording.boxes[jump.gap]).all())
+    """Whether the recording has boxes of all frames after the jump; it may be of fewer frames."""
+    if not len(jump.frames) or jump.frames[-1] >= len(recording):
+        return False
+    return bool(np.isfinite(recording.boxes.take(jump.frames, axis=0)).all())
 
 
 def _outcome(recording: Recording, jump: OwnJump) -> tuple[float, int | None]:
@@ -452,6 +452,7 @@ def phase_answers(
     for held in phases(stride, len(recording)):
         own = held[~seen[held] | (held == 0)]
         seen[own] = True
+        own = own[np.isfinite(recording.boxes[own, 0])]  # a real-time trace lacks some
         columns = [np.interp(frames, own, column) for column in recording.boxes[own].T]
         farther = np.diff(frames, prepend=0) > ceil(stride)
         answers.append(RecordedAnswers(np.stack(columns, axis=1), farther))

@@ -139,11 +139,14 @@ class World:
         _check_kinds("latency", [self.latency], _PLUGIN, latency)
         traces = [*self.passes] if self.timing is None else [self.timing, *self.passes]
         _check_kinds("timing and passes", traces, _TRACE, _A_TRACE)
-        named("search", parse_search, text(self.search))
-        if self.pre_forecaster is not None and self.search == "off":
-            raise LaeError(
-                "pre_forecaster: what it is worth is the search model's: do not turn it off"
-            )
+        named("search", parse_search, named("search", text, self.search))
+        named("keep_size", flag, self.keep_size)
+        if self.pre_forecaster is not None:
+            named("pre_forecaster", text, self.pre_forecaster)
+            if self.search == "off":
+                raise LaeError(
+                    "pre_forecaster: what it is worth is the search model's: do not turn it off"
+                )
         if self.keep_size and self.pre_forecaster is None:
             raise LaeError("keep_size is a way to use a pre_forecaster")
         _check_kinds("convention", [self.convention], (str,), "a name, such as 'pysot'")
