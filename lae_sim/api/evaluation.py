@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
@@ -39,8 +39,9 @@ from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
+from lae_sim.replay.reach import passes_for
 from lae_sim.replay.run import Run, Runs
-from lae_sim.replay.world import TraceLike, World, label_of, named, open_others
+from lae_sim.replay.world import TraceLike, World, label_of, named, open_others, open_trace
 from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
 from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
@@ -190,6 +191,8 @@ def scenarios(
 ) -> list[Scenario]:
     """Each trace in each world; what names stand for is found here, before any work.
 
+    Of several traces, each pass goes with those of its tracker and dataset.
+
     Args:
         traces: traces by name.
         worlds: how they are replayed and scored.
@@ -198,14 +201,16 @@ def scenarios(
         root, dataset, camera_lag: see :func:`lae_sim.learning.registry.find_camera`.
 
     Raises:
-        LaeError: if there is no such convention, forecaster, or trace of times or passes.
+        LaeError: if there is no such convention, forecaster, or trace of times or passes, or a pass
+            goes with none of several traces.
     """
     found = []
+    own = [passes_for([*traces.values()], [*map(open_trace, each.passes)]) for each in worlds]
     names = None if sequences is None else list(sequences)
-    for label, trace in traces.items():
+    for place, (label, trace) in enumerate(traces.items()):
         costs: dict[str, int] | None = None
         made: dict[tuple[Fraction, str], AnyFactory] = {}  # once for all worlds of a rate
-        for world in worlds:
+        for world, passes in zip(worlds, own):
             find_convention(world.convention)
             rate = trace.metadata.fps if world.fps is None else world.fps
             wanted = list(dict.fromkeys(["hold", *world.forecasters]))
@@ -218,7 +223,8 @@ def scenarios(
                     loaded = load_forecaster(each, camera) if isinstance(each, str) else each
                     made[rate, name] = loaded
             searches = made[rate, searching[0]] if searching else None
-            runs = world.replay(trace, names, pre_forecaster=searches)
+            with_own = replace(world, passes=passes[place])
+            runs = with_own.replay(trace, names, pre_forecaster=searches)
             factories = {name: made[rate, name] for name in wanted}
             if costs is None:  # measured once: a sweep is of nothing else
                 costs = resolve_costs(world.costs, factories, trace)
@@ -570,7 +576,8 @@ def evaluate(
         fps: frames that the world shows per second, such as ``30`` or ``"30000/1001"``.
         policy: which frame a free tracker takes, such as ``"latest"`` or ``"fifo"``.
         timing: another device's trace of the same sequences, to take the times from.
-        passes: further traces of the same tracker: at other strides, and gap passes.
+        passes: further traces of the same tracker: at other strides, and gap passes; of several
+            traces, each pass goes with those of its tracker and dataset.
         search: how far the tracker finds its target: ``"trace"`` (what trace and gap passes know),
             ``"c=0.7"``, ``"c=0.6-1.0"`` or ``"off"`` (see
             :func:`lae_sim.replay.search.parse_search`).
