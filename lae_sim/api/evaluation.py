@@ -31,7 +31,7 @@ from lae_sim.errors import LaeError, hint, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
-from lae_sim.evaluation.modelled import MODELLED
+from lae_sim.evaluation.modelled import FIGURES
 from lae_sim.evaluation.totals import Totals, search_report
 from lae_sim.files import sequence_names
 from lae_sim.forecast.base import AnyFactory
@@ -232,7 +232,6 @@ def scenarios(
     return found
 
 
-_MODELLED = ("auc", "auc_low", "auc_high", "dp20", "dp20_low", "dp20_high")
 SETTING = (
     *("trace", "tracker", "dataset", "times_from"),
     *("policy", "fps", "latency", "scale", "convention"),
@@ -283,7 +282,7 @@ class EvaluationResult:
             document = part.document()
             offline = document["offline"] or dict.fromkeys(METRICS)
             for result in document["results"]:
-                modelled = result["modelled"] or dict.fromkeys(_MODELLED)
+                modelled = result["modelled"] or dict.fromkeys(FIGURES)
                 rows.append(
                     {
                         **_setting(part.scenario),
@@ -294,7 +293,7 @@ class EvaluationResult:
                         **{f"offline_{metric}": offline[metric] for metric in METRICS},
                         "recovered_auc": result["recovered_auc"],
                         "recovered_dp20": result["recovered_dp20"],
-                        **{f"modelled_{name}": modelled[name] for name in _MODELLED},
+                        **{f"modelled_{name}": modelled[name] for name in FIGURES},
                         "mismatch_mean": result["mismatch_mean"],
                         "age_ms": result["age_ms"],
                         "skip_rate": document["skip_rate"],
@@ -302,7 +301,7 @@ class EvaluationResult:
                     }
                 )
         numbers = [f"{place}{metric}" for place in ("", "offline_") for metric in METRICS]
-        numbers += ["recovered_auc", "recovered_dp20", *(f"modelled_{name}" for name in _MODELLED)]
+        numbers += ["recovered_auc", "recovered_dp20", *(f"modelled_{name}" for name in FIGURES)]
         return pd.DataFrame(rows).astype(dict.fromkeys(numbers, "float64"))
 
     @cached_property
@@ -462,15 +461,10 @@ def _sequence_table(
     frames = replay.frames[:, None]
     columns: dict[str, Any] = {metric: scored.scores[metric] for metric in METRICS}
     columns |= {f"offline_{metric}": scored.offline[metric][:, None] for metric in METRICS}
-    for end in ("mean", "low", "high"):
-        values = getattr(scored.modelled, end)
-        suffix = "" if end == "mean" else f"_{end}"
-        columns |= {
-            f"modelled_{metric}{suffix}": np.where(
-                scored.modelled.applies[:, None], values[metric], np.nan
-            )
-            for metric in MODELLED
-        }
+    columns |= {
+        f"modelled_{name}": np.where(scored.modelled.applies[:, None], values, np.nan)
+        for name, values in scored.modelled.figures().items()
+    }
     columns |= {
         "world_frames": frames,
         "processed": replay.processed[:, None],
