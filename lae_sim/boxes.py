@@ -88,6 +88,13 @@ def search_distance(searched: Floats, boxes: Floats) -> Floats:
     return distance
 
 
+def resized(box: Sequence[float], size_of: Sequence[float]) -> list[float]:
+    """A box ``x, y, w, h`` around the same centre, with the size of another."""
+    x, y, w, h = box
+    _, _, new_w, new_h = size_of
+    return [x + (w - new_w) / 2, y + (h - new_h) / 2, new_w, new_h]
+
+
 def search_region(box: Sequence[float], image_size: tuple[int, int] | None) -> list[float]:
     """A predicted box as a search region: centre and size ``cx, cy, w, h`` within the image.
 

@@ -26,8 +26,8 @@ from math import ceil, inf, log
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.boxes import iou, search_distance, search_region, search_side
-from lae_sim.errors import LaeError
+from lae_sim.boxes import iou, resized, search_distance, search_region, search_side
+from lae_sim.errors import LaeError, explained
 from lae_sim.forecast.base import AnyFactory, Forecaster, ImageSize, factory_for
 from lae_sim.replay.reach import (
     FOUND_IOU,
@@ -191,13 +191,15 @@ class SearchModel:
         """
         if self.pre_forecaster is None:
             return _Walk(answers, resumed)
-        factory = factory_for(self.pre_forecaster, recording)
+        with explained("the pre-forecaster"):
+            factory = factory_for(self.pre_forecaster, recording)
 
         def walk(reach: float, again: bool) -> tuple[Floats, Bools, float]:
-            forecaster = factory(answers.boxes[0].tolist(), image_size)
-            return _forecast_walk(
-                frames, answers, resumed, reach, again, forecaster, self.keep_size, image_size
-            )
+            with explained("the pre-forecaster"):
+                forecaster = factory(answers.boxes[0].tolist(), image_size)
+                return _forecast_walk(
+                    frames, answers, resumed, reach, again, forecaster, self.keep_size, image_size
+                )
 
         return walk
 
@@ -299,11 +301,10 @@ def _forecast_walk(
     same_to = inf
     resumed_at, found = resumed
     for k, (frame, box) in enumerate(zip(frames[1:].tolist(), rows[1:]), 1):
-        x, y, w, h = forecaster.predict(frame)
+        predicted = forecaster.predict(frame)
         if keep_size:
-            *_, last_w, last_h = answered[-1]
-            x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
-        centre_x, centre_y, w, h = search_region([x, y, w, h], image_size)
+            predicted = resized(predicted, answered[-1])
+        centre_x, centre_y, w, h = search_region(predicted, image_size)
         missed = k < resumed_at or (lost[-1] and k > resumed_at and not again)
         if not missed and (k > resumed_at or not found):
             offset = max(abs(box[0] + box[2] / 2 - centre_x), abs(box[1] + box[3] / 2 - centre_y))

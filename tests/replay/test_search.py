@@ -121,6 +121,15 @@ def test_a_pre_forecaster_says_where_to_search(walk, c, keep_size):
     np.testing.assert_allclose(found.boxes[0], expected, rtol=1e-9, atol=1e-9)
 
 
+def test_a_pre_forecaster_that_fails_is_named():
+    def broken(box, image_size):
+        raise ZeroDivisionError("no motion")
+
+    recording, frames = straight(), np.array([0, 2])
+    with pytest.raises(LaeError, match="the pre-forecaster: ZeroDivisionError: no motion"):
+        model(1, pre_forecaster=broken).outcomes(recording, frames, recorded(recording, frames))
+
+
 @settings(max_examples=100, deadline=None)
 @given(walks())
 def test_the_ends_of_what_a_reach_can_be(walk):
