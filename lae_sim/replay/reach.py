@@ -9,6 +9,7 @@ regions are squares that grow with the target.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -93,7 +94,7 @@ class Reach:
 
     Attributes:
         centre: median of the reach, in units of ``search_side``.
-        spread: scale of the logistic distribution; its standard deviation is 1.81 times that.
+        spread: scale of the logistic distribution.
         centre_error, spread_error: their standard errors.
         restarts: how many it was fitted to.
     """
@@ -103,6 +104,11 @@ class Reach:
     centre_error: float
     spread_error: float
     restarts: int
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the reach, in units of ``search_side``."""
+        return self.spread * math.pi / math.sqrt(3)
 
     def quantiles(self, n: int) -> Floats:
         """``n`` reaches that stand for the distribution, float64 [n], ascending, none below 0.

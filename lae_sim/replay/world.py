@@ -300,11 +300,18 @@ class World:
             sequences: those wanted; all by default.
             batch: schedule many sequences at once where policy and latency allow it (see
                 :func:`lae_sim.engine.lanes.batchable`). The runs are the same.
-            pre_forecaster: what the world's name of one stands for; without it, none is used.
+            pre_forecaster: what the world's name of one stands for (see
+                :func:`lae_sim.learning.registry.load_forecaster`).
 
         Raises:
-            LaeError: if a trace is missing or damaged, or the passes do not go together.
+            LaeError: if a trace is missing or damaged, the passes do not go together, or what the
+                name of a pre-forecaster stands for is not given.
         """
+        if self.pre_forecaster is not None and pre_forecaster is None:
+            raise LaeError(
+                f"pre_forecaster: give what {self.pre_forecaster!r} stands for, such as "
+                f"load_forecaster({self.pre_forecaster!r})"
+            )
         names = None if sequences is None else sequence_names(sequences)
         opened = open_trace(trace, names)
         strided, gaps = split_passes(map(open_trace, self.passes))

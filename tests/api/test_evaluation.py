@@ -347,6 +347,14 @@ def test_of_several_traces_each_pass_goes_with_its_own(tmp_path: Path) -> None:
         lae_sim.evaluate([SLOW, FAST], passes=other)
 
 
+def test_a_world_does_not_forget_its_pre_forecaster() -> None:
+    world = lae_sim.World.of(latency="constant:80ms", search="c=0.3", pre_forecaster="kalman")
+    with pytest.raises(lae_sim.LaeError, match="pre_forecaster: give what 'kalman' stands for"):
+        world.replay(SLOW)
+    runs = world.replay(SLOW, pre_forecaster=lae_sim.load_forecaster("kalman"))
+    assert all(run.modelled.forecast for run in runs)
+
+
 def test_a_result_may_be_gone_through_again(result: lae_sim.EvaluationResult) -> None:
     runs = result.parts[0].scenario.runs
     assert [run.recording.name for run in runs] == [run.recording.name for run in runs]
