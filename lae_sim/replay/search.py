@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import lru_cache
 from math import ceil, inf, log
 
 import numpy as np
@@ -403,17 +404,13 @@ def find_search(
     if asked == "off" or searched is not None:  # the model would have to search where that one did
         return None
     reach: Reach | None = None
-    jumps: dict[str, list[OwnJump]] = {}
+    jumps: Mapping[str, Sequence[OwnJump]] = {}
     known, low, high = False, 0.0, 0.0
     if isinstance(asked, ReachRange):
         low, high, known = asked.low, asked.high, asked.low == asked.high
         source = f"c = {low:g}" + ("" if known else f" to {high:g}") + ", as given"
     else:
-        gaps = tuple(gaps)
-        for trace in gaps:
-            for name, own in own_jumps(trace).items():
-                jumps.setdefault(name, []).extend(own)
-        reach = fit_reach(restart for trace in gaps for restart in restarts_of(trace))
+        reach, jumps = _measured(tuple(gaps))
         if reach is not None:
             known = True
             source = (
@@ -432,6 +429,16 @@ def find_search(
     else:
         reaches = np.array([low, (low + high) / 2, high])
     return SearchModel(reaches, known, source, reach, jumps, pre_forecaster, keep_size)
+
+
+@lru_cache(maxsize=8)  # a sweep asks in every world
+def _measured(gaps: tuple[Trace, ...]) -> tuple[Reach | None, Mapping[str, Sequence[OwnJump]]]:
+    """The curve that some gap passes show together, and own jumps by sequence."""
+    jumps: dict[str, list[OwnJump]] = {}
+    for trace in gaps:
+        for name, own in own_jumps(trace).items():
+            jumps.setdefault(name, []).extend(own)
+    return fit_reach(restart for trace in gaps for restart in restarts_of(trace)), jumps
 
 
 def phase_answers(

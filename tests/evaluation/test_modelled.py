@@ -11,13 +11,14 @@ from places import SHARED, TRACES
 
 import lae_sim
 from lae_sim.evaluation.evaluate import Evaluation, evaluate_groups, evaluate_runs
+from lae_sim.evaluation.metrics import PYSOT
 from lae_sim.evaluation.modelled import MODELLED, UNEXPLAINED, Ranking, over_sigmas
 from lae_sim.evaluation.totals import ModelledTotals
 from lae_sim.forecast.base import Hold
 from lae_sim.forecast.kalman import Kalman
 from lae_sim.replay.reach import Reach
 from lae_sim.replay.run import Runs
-from lae_sim.replay.search import SearchModel
+from lae_sim.replay.search import Outcomes, SearchModel
 from lae_sim.replay.world import SIGMA_GRID, World
 
 SLOW = TRACES / "synthetic-slow.parquet"
@@ -143,6 +144,19 @@ def test_groups_of_sequences_change_nothing():
             here, there = (getattr(e.modelled, name)[metric] for e in (whole, joined))
             assert np.array_equal(here, there), (metric, name)
         assert np.allclose(whole.modelled.draws[metric], joined.modelled.draws[metric])
+
+
+def test_an_outcome_in_which_a_sequence_leaves_the_mean_has_no_weight():
+    """By some conventions a sequence that scores 0 everywhere leaves the mean."""
+    run = next(iter(runs_of("c=0.2")))
+    far = np.full_like(run.boxes, 5000.0)  # nowhere near, at the first frame too
+    outcomes = Outcomes((run.boxes, far), np.array([0.0, 1.0]), np.array([[0.3, 0.7]]), True)
+    metadata, dropping = lae_sim.read_trace(SLOW).metadata, replace(PYSOT, drops_zeros=True)
+    found = evaluate_runs(
+        [replace(run, modelled=outcomes)], metadata, {"hold": Hold}, convention=dropping
+    )
+    assert np.isfinite(found.modelled.mean["auc"]).all()
+    assert found.modelled.mean["auc"][0, 0, 0] == pytest.approx(found.scores["auc"][0, 0, 0])
 
 
 def test_the_model_changes_nothing_of_what_was_recorded():
