@@ -205,12 +205,15 @@ def scenarios(
             goes with none of several traces.
     """
     found = []
-    own = [passes_for([*traces.values()], [*map(open_trace, each.passes)]) for each in worlds]
+    own = {
+        passes: passes_for([*traces.values()], [*map(open_trace, passes)])
+        for passes in dict.fromkeys(world.passes for world in worlds)
+    }
     names = None if sequences is None else list(sequences)
     for place, (label, trace) in enumerate(traces.items()):
         costs: dict[str, int] | None = None
         made: dict[tuple[Fraction, str], AnyFactory] = {}  # once for all worlds of a rate
-        for world, passes in zip(worlds, own):
+        for world in worlds:
             find_convention(world.convention)
             rate = trace.metadata.fps if world.fps is None else world.fps
             wanted = list(dict.fromkeys(["hold", *world.forecasters]))
@@ -223,7 +226,7 @@ def scenarios(
                     loaded = load_forecaster(each, camera) if isinstance(each, str) else each
                     made[rate, name] = loaded
             searches = made[rate, searching[0]] if searching else None
-            with_own = replace(world, passes=passes[place])
+            with_own = replace(world, passes=own[world.passes][place])
             runs = with_own.replay(trace, names, pre_forecaster=searches)
             factories = {name: made[rate, name] for name in wanted}
             if costs is None:  # measured once: a sweep is of nothing else
