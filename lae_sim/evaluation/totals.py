@@ -15,7 +15,7 @@ import numpy as np
 from lae_sim._arrays import Floats, Ints
 from lae_sim.evaluation.evaluate import Curves, Evaluation, ReplayStatistics, Staleness
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.modelled import MODELLED, interval, named_figures, over_sigmas, summed
+from lae_sim.evaluation.modelled import MODELLED, interval, named_figures, over_sigmas
 from lae_sim.replay.search import SearchModel
 
 RECOVERED = ("auc", "dp20")
@@ -169,7 +169,7 @@ class ModelledTotals:
         self.known: bool | None = None
         self.applies = 0
         self.unexplained: Mapping[str, float] = {}
-        self._draws: dict[str, list[Floats]] = {metric: [] for metric in MODELLED}
+        self._draws: dict[str, Floats] = dict.fromkeys(MODELLED, np.zeros(()))
         self._scores = {metric: Mean() for metric in MODELLED}
         self._changes = {metric: Changes(hold) for metric in MODELLED}
         self._outputs = self._lost_outputs = 0.0
@@ -183,8 +183,7 @@ class ModelledTotals:
         self._outputs += float(outputs.sum())
         self._lost_outputs += float(modelled.lost_share @ outputs)
         for metric in MODELLED:
-            so_far = self._draws[metric]
-            self._draws[metric] = [summed([*so_far, modelled.draws[metric]])]
+            self._draws[metric] = self._draws[metric] + modelled.draws[metric]
             scores = modelled.mean[metric].transpose(0, 2, 1)
             self._scores[metric].add(scores)
             self._changes[metric].add(scores, part.offline[metric])
@@ -196,8 +195,7 @@ class ModelledTotals:
 
     def draws(self, metric: str) -> Floats:
         """Joint draws over all sequences, float64 [2, F, J, M] (see :class:`.ModelledScores`)."""
-        (draws,) = self._draws[metric]
-        return draws
+        return self._draws[metric]
 
     def figures(self, over_grid: bool = False) -> dict[str, Floats]:
         """Mean scores and the ends of their intervals, by the names of :data:`.modelled.FIGURES`.

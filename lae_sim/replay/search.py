@@ -410,7 +410,8 @@ def find_search(
         low, high, known = asked.low, asked.high, asked.low == asked.high
         source = f"c = {low:g}" + ("" if known else f" to {high:g}") + ", as given"
     else:
-        reach, jumps = _measured(tuple(gaps))
+        given = tuple(gaps)
+        reach, jumps = _measured(given)
         if reach is not None:
             known = True
             source = (
@@ -421,7 +422,8 @@ def find_search(
             declared = metadata.search
             side = 1.0 if declared is None else declared.half_side
             low, high = (each * side for each in UNKNOWN_REACH)
-            source = f"c is unknown, {low:g} to {high:g} assumed"
+            why = " (the restarts are too few, or all come out alike)" if given else ""
+            source = f"c is unknown{why}, {low:g} to {high:g} assumed"
     if reach is not None:
         reaches = reach.quantiles(DRAWS)
     elif known:
