@@ -39,7 +39,7 @@ from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
-from lae_sim.replay.reach import passes_for
+from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import TraceLike, World, label_of, named, open_others, open_trace
 from lae_sim.report.replay import SequenceRows, attribute_members, trace_report

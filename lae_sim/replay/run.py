@@ -19,7 +19,7 @@ from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.forecast.base import ImageSize
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
-from lae_sim.replay.reach import split_passes
+from lae_sim.replay.passes import split_passes
 from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace

@@ -30,7 +30,7 @@ from lae_sim.replay.latency import (
     scaled,
     time_label,
 )
-from lae_sim.replay.reach import split_passes
+from lae_sim.replay.passes import split_passes
 from lae_sim.replay.run import Runs
 from lae_sim.replay.search import find_search, parse_search
 from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
