@@ -414,9 +414,10 @@ def find_search(
         reach, jumps = _measured(given)
         if reach is not None:
             known = True
+            others = sorted({trace.metadata.tracker for trace in given} - {metadata.tracker})
             source = (
                 f"c = {reach.centre:.2f}, spread {reach.spread:.2f}, measured by "
-                f"{reach.restarts:,} restarts"
+                f"{reach.restarts:,} restarts" + (f" of {', '.join(others)}" if others else "")
             )
         else:
             declared = metadata.search

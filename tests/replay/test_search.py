@@ -275,6 +275,21 @@ def test_its_reach_is_recovered_from_its_gap_pass():
         assert found.reaches.mean() == pytest.approx(reach, abs=0.05)
 
 
+def test_whose_restarts_measured_a_reach_is_said_where_they_are_of_another_tracker():
+    *_, gaps = obedient_traces(0.5, 5)
+    count = f"measured by {len(gaps.names):,} restarts"
+    assert find_search("trace", EVERY, [gaps]).source.endswith(count)
+    another = Metadata.new("30", "every-frame", tracker={"name": "another"})
+    assert find_search("trace", another, [gaps]).source.endswith(f"{count} of unknown")
+
+
+def test_restarts_that_tell_no_curve_leave_the_reach_unknown():
+    few = Trace(Metadata.new("30", "restarts"), list(obedient_traces(0.5, 5)[-1])[:9])
+    found = find_search("trace", EVERY, [few])
+    assert (found.known, found.reach) == (False, None)
+    assert "the restarts are too few" in found.source
+
+
 def test_passes_widen_what_is_likely_and_the_replayed_boxes_keep_half_the_weight():
     made, every, passes, gaps = obedient_traces(0.7, 11)
     strided = {trace.metadata.stride: trace for trace in passes}
