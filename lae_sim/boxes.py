@@ -60,12 +60,12 @@ def search_side(boxes: Floats) -> Floats:
     Siamese Networks for Object Tracking", 2016, sec. 2.2).
 
     Args:
-        boxes: float64 [..., 4].
+        boxes: float64 [..., 4]; a size below 0 counts as none.
 
     Returns:
         float64 [...]; NaN where the box is.
     """
-    w, h = boxes[..., 2], boxes[..., 3]
+    w, h = (np.maximum(boxes[..., side], 0.0) for side in (2, 3))
     context = (w + h) / 2
     side: Floats = np.sqrt((w + context) * (h + context))
     return side
@@ -89,6 +89,13 @@ def search_distance(searched: Floats, boxes: Floats) -> Floats:
         distance: Floats = offset / search_side(searched)
     distance[~((searched[:, 2] > 0) & (searched[:, 3] > 0))] = np.nan
     return distance
+
+
+def resized(box: Sequence[float], size_of: Sequence[float]) -> list[float]:
+    """A box ``x, y, w, h`` around the same centre, with the size of another."""
+    x, y, w, h = box
+    _, _, new_w, new_h = size_of
+    return [x + (w - new_w) / 2, y + (h - new_h) / 2, new_w, new_h]
 
 
 def search_region(box: Sequence[float], image_size: tuple[int, int] | None) -> list[float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
@@ -31,7 +31,7 @@ from lae_sim.errors import LaeError, hint, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
-from lae_sim.evaluation.modelled import MODELLED
+from lae_sim.evaluation.modelled import FIGURES
 from lae_sim.evaluation.totals import Totals, search_report
 from lae_sim.files import sequence_names
 from lae_sim.forecast.base import AnyFactory
@@ -39,8 +39,9 @@ from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
+from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import Run, Runs
-from lae_sim.replay.world import TraceLike, World, label_of, named, open_others
+from lae_sim.replay.world import TraceLike, World, label_of, named, open_others, open_trace
 from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
 from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
@@ -190,6 +191,8 @@ def scenarios(
 ) -> list[Scenario]:
     """Each trace in each world; what names stand for is found here, before any work.
 
+    Of several traces, each pass goes with those of its tracker and dataset.
+
     Args:
         traces: traces by name.
         worlds: how they are replayed and scored.
@@ -198,11 +201,16 @@ def scenarios(
         root, dataset, camera_lag: see :func:`lae_sim.learning.registry.find_camera`.
 
     Raises:
-        LaeError: if there is no such convention, forecaster, or trace of times or passes.
+        LaeError: if there is no such convention, forecaster, or trace of times or passes, or a pass
+            goes with none of several traces.
     """
     found = []
+    own = {
+        passes: passes_for([*traces.values()], [*map(open_trace, passes)])
+        for passes in dict.fromkeys(world.passes for world in worlds)
+    }
     names = None if sequences is None else list(sequences)
-    for label, trace in traces.items():
+    for place, (label, trace) in enumerate(traces.items()):
         costs: dict[str, int] | None = None
         made: dict[tuple[Fraction, str], AnyFactory] = {}  # once for all worlds of a rate
         for world in worlds:
@@ -218,7 +226,8 @@ def scenarios(
                     loaded = load_forecaster(each, camera) if isinstance(each, str) else each
                     made[rate, name] = loaded
             searches = made[rate, searching[0]] if searching else None
-            runs = world.replay(trace, names, pre_forecaster=searches)
+            with_own = replace(world, passes=own[world.passes][place])
+            runs = with_own.replay(trace, names, pre_forecaster=searches)
             factories = {name: made[rate, name] for name in wanted}
             if costs is None:  # measured once: a sweep is of nothing else
                 costs = resolve_costs(world.costs, factories, trace)
@@ -226,7 +235,6 @@ def scenarios(
     return found
 
 
-_MODELLED = ("auc", "auc_low", "auc_high", "dp20", "dp20_low", "dp20_high")
 SETTING = (
     *("trace", "tracker", "dataset", "times_from"),
     *("policy", "fps", "latency", "scale", "convention"),
@@ -277,7 +285,7 @@ class EvaluationResult:
             document = part.document()
             offline = document["offline"] or dict.fromkeys(METRICS)
             for result in document["results"]:
-                modelled = result["modelled"] or dict.fromkeys(_MODELLED)
+                modelled = result["modelled"] or dict.fromkeys(FIGURES)
                 rows.append(
                     {
                         **_setting(part.scenario),
@@ -288,7 +296,7 @@ class EvaluationResult:
                         **{f"offline_{metric}": offline[metric] for metric in METRICS},
                         "recovered_auc": result["recovered_auc"],
                         "recovered_dp20": result["recovered_dp20"],
-                        **{f"modelled_{name}": modelled[name] for name in _MODELLED},
+                        **{f"modelled_{name}": modelled[name] for name in FIGURES},
                         "mismatch_mean": result["mismatch_mean"],
                         "age_ms": result["age_ms"],
                         "skip_rate": document["skip_rate"],
@@ -296,7 +304,7 @@ class EvaluationResult:
                     }
                 )
         numbers = [f"{place}{metric}" for place in ("", "offline_") for metric in METRICS]
-        numbers += ["recovered_auc", "recovered_dp20", *(f"modelled_{name}" for name in _MODELLED)]
+        numbers += ["recovered_auc", "recovered_dp20", *(f"modelled_{name}" for name in FIGURES)]
         return pd.DataFrame(rows).astype(dict.fromkeys(numbers, "float64"))
 
     @cached_property
@@ -456,15 +464,10 @@ def _sequence_table(
     frames = replay.frames[:, None]
     columns: dict[str, Any] = {metric: scored.scores[metric] for metric in METRICS}
     columns |= {f"offline_{metric}": scored.offline[metric][:, None] for metric in METRICS}
-    for end in ("mean", "low", "high"):
-        values = getattr(scored.modelled, end)
-        suffix = "" if end == "mean" else f"_{end}"
-        columns |= {
-            f"modelled_{metric}{suffix}": np.where(
-                scored.modelled.applies[:, None], values[metric], np.nan
-            )
-            for metric in MODELLED
-        }
+    columns |= {
+        f"modelled_{name}": np.where(scored.modelled.applies[:, None], values, np.nan)
+        for name, values in scored.modelled.figures().items()
+    }
     columns |= {
         "world_frames": frames,
         "processed": replay.processed[:, None],
@@ -570,7 +573,8 @@ def evaluate(
         fps: frames that the world shows per second, such as ``30`` or ``"30000/1001"``.
         policy: which frame a free tracker takes, such as ``"latest"`` or ``"fifo"``.
         timing: another device's trace of the same sequences, to take the times from.
-        passes: further traces of the same tracker: at other strides, and gap passes.
+        passes: further traces of the same tracker: at other strides, and gap passes; of several
+            traces, each pass goes with those of its tracker and dataset.
         search: how far the tracker finds its target: ``"trace"`` (what trace and gap passes know),
             ``"c=0.7"``, ``"c=0.6-1.0"`` or ``"off"`` (see
             :func:`lae_sim.replay.search.parse_search`).

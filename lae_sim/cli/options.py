@@ -54,7 +54,8 @@ def add_passes(add: Callable[..., argparse.Action]) -> None:
         metavar="TRACE",
         help="further passes of the tracker: on every N-th frame (lae-sim profile --stride; each "
         "sequence's boxes come from the one nearest to the frames skipped), and gap passes "
-        "(--gaps), which say how far it reaches",
+        "(--gaps), which say how far it reaches; of several traces, each goes with those of its "
+        "tracker and dataset",
     )
 
 

@@ -16,13 +16,13 @@ from lae_sim.errors import LaeError
 from lae_sim.evaluation.caveats import left_search, notes_on, search_notes
 from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
 from lae_sim.evaluation.metrics import METRICS, find_convention
-from lae_sim.evaluation.modelled import MODELLED, Ranking
+from lae_sim.evaluation.modelled import Ranking
 from lae_sim.evaluation.totals import ModelledTotals, search_report
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.forecast.kalman import TunedKalman
 from lae_sim.learning.folds import Examples, Trainer, assign_folds, cross_fitted
-from lae_sim.replay.reach import passes_for
+from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import Runs
 from lae_sim.replay.world import RECORDED, SIGMA_GRID, World, label_of, open_trace
 from lae_sim.trace.describe import InitCost
@@ -228,9 +228,8 @@ def _rows(found: Evaluation, forecasters: Sequence[str], sigmas: Sequence[Fracti
     sequences, count = found.replay.sequences, len(sigmas)
     shape = 1, len(sequences), count
     scores = {metric: (found.scores[metric], metric) for metric in METRICS}
-    for metric in MODELLED:
-        for end, each in (("", "mean"), ("_low", "low"), ("_high", "high")):
-            scores[f"modelled_{metric}{end}"] = (getattr(found.modelled, each)[metric], metric)
+    for name, each in found.modelled.figures().items():
+        scores[f"modelled_{name}"] = (each, name.partition("_")[0])
     values = [
         np.concatenate([each, np.broadcast_to(found.offline[metric][:, None], shape)])
         for each, metric in scores.values()

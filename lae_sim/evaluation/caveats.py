@@ -53,7 +53,11 @@ def search_notes(search: Mapping[str, Any]) -> list[str]:
     Args:
         search: what :func:`lae_sim.evaluation.totals.search_report` gives.
     """
-    interval = "an interval of 95 %" if search["c_known"] else "the ends of that range"
+    interval = "the ends of that range"
+    if search["c_known"]:  # what is unexplained is measured so: see modelled.UNEXPLAINED_FORECAST
+        share = "95 %" if search["pre_forecaster"] is None else "about 90 %"
+        given = ", if that is c" if search["reach"] is None else ""
+        interval = f"an interval of {share}{given}"
     lines = [
         "modelled: a target is found within c search sides of where the tracker searches; "
         f"{search['source']};",

@@ -23,6 +23,10 @@ from lae_sim.replay.search import Outcomes
 MODELLED = ("auc", "dp20")
 """The metrics that are modelled."""
 
+_ENDS = ("", "_low", "_high")
+FIGURES = tuple(f"{metric}{end}" for metric in MODELLED for end in _ENDS)
+"""The names of modelled scores and of the ends of their intervals."""
+
 UNEXPLAINED: Mapping[str, float] = {"auc": 0.0165, "dp20": 0.031}
 """What the model leaves unexplained of one sequence's score: half the width of an interval.
 
@@ -65,6 +69,10 @@ class ModelledScores:
     high: Mapping[str, Floats]
     lost_share: Floats
     draws: Mapping[str, Floats]
+
+    def figures(self) -> dict[str, Floats]:
+        """Means and ends by the names of :data:`FIGURES`, float64 [F, S, M] in 0..1."""
+        return named_figures(self.mean, self.low, self.high)
 
     @classmethod
     def joined(cls, parts: Sequence[ModelledScores]) -> ModelledScores:
@@ -202,6 +210,11 @@ class Ranking:
     def __str__(self) -> str:
         scores = "modelled scores" if self.modelled else "scores of the recorded boxes"
         return f"ranked by the {scores}" + (f": {self.reason}" if self.reason else "")
+
+
+def named_figures(*values: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Means, low and high ends, each by metric, by the names of :data:`FIGURES`."""
+    return {f"{metric}{end}": of[metric] for metric in MODELLED for end, of in zip(_ENDS, values)}
 
 
 def summed(draws: Sequence[Floats]) -> Floats:

@@ -15,7 +15,7 @@ import numpy as np
 from lae_sim._arrays import Floats, Ints
 from lae_sim.evaluation.evaluate import Curves, Evaluation, ReplayStatistics, Staleness
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.modelled import MODELLED, interval, over_sigmas, summed
+from lae_sim.evaluation.modelled import MODELLED, interval, named_figures, over_sigmas
 from lae_sim.replay.search import SearchModel
 
 RECOVERED = ("auc", "dp20")
@@ -52,6 +52,32 @@ class Mean:
         return self.total / np.where(self._counts > 0, self._counts, np.nan)
 
 
+class Changes:
+    """What F forecasters win over hold at M permitted latencies, added up over sequences.
+
+    Attributes:
+        won: forecast - hold, of the sequences where this and what was lost are known.
+        lost: offline - hold, of the same.
+    """
+
+    def __init__(self, hold: int) -> None:
+        """With the index of hold."""
+        self._hold = hold
+        self.won, self.lost = Mean(), Mean()
+
+    def add(self, scores: Floats, offline: Floats) -> None:
+        """Add some sequences: their scores, float64 [F, M, S], and the offline ones, [S]."""
+        hold = scores[self._hold]
+        won, lost = scores - hold, np.broadcast_to(offline - hold, scores.shape)
+        counted = ~np.isnan(won + lost)
+        self.won.add(np.where(counted, won, np.nan))
+        self.lost.add(np.where(counted, lost, np.nan))
+
+    def recovered(self, f: int, m: int) -> float | None:
+        """The share of the latency loss that a forecaster wins back; None without a loss."""
+        return recovered(float(self.won.total[f, m]), float(self.lost.total[f, m]))
+
+
 class ScoreTotals:
     """Scores of F forecasters at M permitted latencies, added up over sequences.
 
@@ -64,11 +90,9 @@ class ScoreTotals:
         """With the index of the forecaster that others are to do better than."""
         self.sequences = 0
         self.complete = True
-        self._hold = hold
         self._scores = {metric: Mean() for metric in METRICS}
         self._offline = {metric: Mean() for metric in METRICS}
-        self._won = {metric: Mean() for metric in RECOVERED}
-        self._lost = {metric: Mean() for metric in RECOVERED}
+        self._changes = {metric: Changes(hold) for metric in RECOVERED}
 
     def add(self, part: Evaluation, which: slice | Sequence[int] = slice(None)) -> None:
         """Add some sequences of a part."""
@@ -81,11 +105,7 @@ class ScoreTotals:
             self._scores[metric].add(scores)
             self._offline[metric].add(offline)
             if metric in RECOVERED and self.complete:
-                hold = scores[self._hold]
-                won, lost = scores - hold, np.broadcast_to(offline - hold, scores.shape)
-                counted = ~np.isnan(won + lost)
-                self._won[metric].add(np.where(counted, won, np.nan))
-                self._lost[metric].add(np.where(counted, lost, np.nan))
+                self._changes[metric].add(scores, offline)
 
     def mean(self, metric: str) -> Floats:
         """Mean scores, float64 [F, M]; NaN if no sequence counts."""
@@ -95,13 +115,9 @@ class ScoreTotals:
         """The mean of the trace's own boxes; NaN unless it is complete and a sequence counts."""
         return float(self._offline[metric].value) if self.complete else np.nan
 
-    def won(self, metric: str) -> Floats:
-        """How much better than hold, added up over the sequences that count, float64 [F, M]."""
-        return self._won[metric].total
-
-    def lost(self, metric: str) -> Floats:
-        """How much better than hold the offline scores are, over the same sequences, [F, M]."""
-        return self._lost[metric].total
+    def changes(self, metric: str) -> Changes:
+        """What forecasters win over hold, and what there is to win."""
+        return self._changes[metric]
 
 
 class CurveTotals:
@@ -153,11 +169,9 @@ class ModelledTotals:
         self.known: bool | None = None
         self.applies = 0
         self.unexplained: Mapping[str, float] = {}
-        self._hold = hold
-        self._draws: dict[str, list[Floats]] = {metric: [] for metric in MODELLED}
+        self._draws: dict[str, Floats] = dict.fromkeys(MODELLED, np.zeros(()))
         self._scores = {metric: Mean() for metric in MODELLED}
-        self._won = {metric: Mean() for metric in MODELLED}
-        self._lost = {metric: Mean() for metric in MODELLED}
+        self._changes = {metric: Changes(hold) for metric in MODELLED}
         self._outputs = self._lost_outputs = 0.0
 
     def add(self, part: Evaluation) -> None:
@@ -169,15 +183,10 @@ class ModelledTotals:
         self._outputs += float(outputs.sum())
         self._lost_outputs += float(modelled.lost_share @ outputs)
         for metric in MODELLED:
-            so_far = self._draws[metric]
-            self._draws[metric] = [summed([*so_far, modelled.draws[metric]])]
+            self._draws[metric] = self._draws[metric] + modelled.draws[metric]
             scores = modelled.mean[metric].transpose(0, 2, 1)
-            hold = scores[self._hold]
             self._scores[metric].add(scores)
-            won, lost = scores - hold, np.broadcast_to(part.offline[metric] - hold, scores.shape)
-            counted = ~np.isnan(won + lost)
-            self._won[metric].add(np.where(counted, won, np.nan))
-            self._lost[metric].add(np.where(counted, lost, np.nan))
+            self._changes[metric].add(scores, part.offline[metric])
 
     @property
     def lost_share(self) -> float:
@@ -186,11 +195,10 @@ class ModelledTotals:
 
     def draws(self, metric: str) -> Floats:
         """Joint draws over all sequences, float64 [2, F, J, M] (see :class:`.ModelledScores`)."""
-        (draws,) = self._draws[metric]
-        return draws
+        return self._draws[metric]
 
     def figures(self, over_grid: bool = False) -> dict[str, Floats]:
-        """Mean scores, and the ends of their intervals: auc, auc_low, auc_high, dp20, ...
+        """Mean scores and the ends of their intervals, by the names of :data:`.modelled.FIGURES`.
 
         Args:
             over_grid: whether they are of the plain means over the permitted latencies.
@@ -198,19 +206,19 @@ class ModelledTotals:
         Returns:
             float64 [F, M]; with ``over_grid`` [F, 1].
         """
-        figures: dict[str, Floats] = {}
+        means, lows, highs = {}, {}, {}
         for metric in MODELLED:
             draws = self.draws(metric)
             mean = self._scores[metric].value
             if over_grid:
                 draws, mean = over_sigmas(draws), mean.mean(axis=1, keepdims=True)
             ends = interval(draws, bool(self.known), self.unexplained[metric], self.applies)
-            figures |= dict(zip((metric, f"{metric}_low", f"{metric}_high"), (mean, *ends)))
-        return figures
+            means[metric], (lows[metric], highs[metric]) = mean, ends
+        return named_figures(means, lows, highs)
 
-    def recovered(self, metric: str) -> tuple[Floats, Floats]:
-        """How much better than hold, and how much better the offline scores are, [F, M] each."""
-        return self._won[metric].total, self._lost[metric].total
+    def changes(self, metric: str) -> Changes:
+        """What forecasters win over hold by the modelled scores, and what there is to win."""
+        return self._changes[metric]
 
 
 def search_report(

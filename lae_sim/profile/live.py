@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.boxes import search_region
+from lae_sim.boxes import resized, search_region
 from lae_sim.datasets.frames import Image, ImageSequence
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import latest, listed
@@ -205,12 +205,11 @@ class Live:
             return self._tracker.track(image)
         with explained("the pre-forecaster"):
             before = perf_counter_ns()
-            x, y, w, h = self._forecaster.predict(frame)
+            predicted = self._forecaster.predict(frame)
             spent = perf_counter_ns() - before
             if self._keep_size:
-                _, _, last_w, last_h = self._last_box
-                x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
-            search = search_region([x, y, w, h], self._size)
+                predicted = resized(predicted, self._last_box)
+            search = search_region(predicted, self._size)
         answer = self._tracker.track(image, search)
         if answer.box is not None:
             self._last_box = answer.box

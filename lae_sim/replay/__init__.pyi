@@ -12,6 +12,7 @@ from .latency import (
 )
 from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
 from .run import Run, Runs, replay_repeated, replay_sequence
+from .search import Outcomes, SearchModel, find_search
 from .strides import followed, phases
 from .world import (
     SIGMA_GRID,
@@ -26,18 +27,21 @@ from .world import (
 __all__ = [
     "SIGMA_GRID",
     "LatencySource",
+    "Outcomes",
     "OwnJump",
     "RandomSource",
     "Reach",
     "Restart",
     "Run",
     "Runs",
+    "SearchModel",
     "TraceLike",
     "World",
     "bootstrap",
     "by_call",
     "by_frame",
     "constant",
+    "find_search",
     "fit_reach",
     "followed",
     "initialised",

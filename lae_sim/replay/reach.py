@@ -9,9 +9,9 @@ regions are squares that grow with the target.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,6 @@ from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou, search_distance
 from lae_sim.errors import LaeError
 from lae_sim.trace.file import Trace
-from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 from lae_sim.trace.restarts import RestartName
 
@@ -93,7 +92,7 @@ class Reach:
 
     Attributes:
         centre: median of the reach, in units of ``search_side``.
-        spread: scale of the logistic distribution; its standard deviation is 1.81 times that.
+        spread: scale of the logistic distribution.
         centre_error, spread_error: their standard errors.
         restarts: how many it was fitted to.
     """
@@ -103,6 +102,11 @@ class Reach:
     centre_error: float
     spread_error: float
     restarts: int
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the reach, in units of ``search_side``."""
+        return self.spread * math.pi / math.sqrt(3)
 
     def quantiles(self, n: int) -> Floats:
         """``n`` reaches that stand for the distribution, float64 [n], ascending, none below 0.
@@ -157,46 +161,6 @@ def own_jumps(trace: Trace) -> dict[str, list[OwnJump]]:
         )
         jumps.setdefault(name.sequence, []).append(jump)
     return {name: sorted(each, key=lambda jump: jump.gap) for name, each in jumps.items()}
-
-
-def split_passes(passes: Iterable[Trace]) -> tuple[tuple[Trace, ...], tuple[Trace, ...]]:
-    """Passes of every N-th frame, and gap passes, told apart by their metadata."""
-    every = tuple(passes)
-    gaps = tuple(trace for trace in every if trace.metadata.kind == "restarts")
-    return tuple(trace for trace in every if trace not in gaps), gaps
-
-
-class Described(Protocol):
-    """What has the metadata of a trace: a trace, or what stands for one."""
-
-    @property
-    def metadata(self) -> Metadata:
-        """What the trace says of itself."""
-
-
-Pass = TypeVar("Pass", bound=Described)
-
-
-def passes_for(traces: Sequence[Described], passes: Sequence[Pass]) -> list[tuple[Pass, ...]]:
-    """The passes that go with each of some traces: those of its tracker and dataset.
-
-    A single trace has all of them, whatever they say of themselves.
-
-    Raises:
-        LaeError: if a pass goes with none of several traces.
-    """
-    if len(traces) == 1:
-        return [tuple(passes)]
-    for each in passes:
-        if not any(trace.metadata.goes_with(each.metadata) for trace in traces):
-            raise LaeError(
-                f"a pass is of {each.metadata.tracker} on {each.metadata.dataset}: none of the "
-                "traces is of the same tracker and dataset"
-            )
-    return [
-        tuple(each for each in passes if trace.metadata.goes_with(each.metadata))
-        for trace in traces
-    ]
 
 
 def fit_reach(restarts: Iterable[Restart]) -> Reach | None:

@@ -19,7 +19,7 @@ from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.forecast.base import ImageSize
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
-from lae_sim.replay.reach import split_passes
+from lae_sim.replay.passes import split_passes
 from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
@@ -157,7 +157,9 @@ class _Job:
                 parted |= iou(_boxes(passes[other], frames), boxes) < PARTED_IOU
             disagreement = float(parted.mean())
         run = Run(self.recording, schedule, boxes, departures, disagreement)
-        if self.search is None or not (departures or self.search.pre_forecaster is not None):
+        if self.search is None or len(frames) == 1:
+            return run
+        if not departures and self.search.pre_forecaster is None:
             return run
         farther = np.append(False, np.diff(frames) > (frames - before.take(frames))[1:])
         recorded = [RecordedAnswers(boxes, farther)]

@@ -28,7 +28,7 @@ from math import ceil, inf, log
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.boxes import iou, search_distance, search_region, search_side
+from lae_sim.boxes import iou, resized, search_distance, search_region, search_side
 from lae_sim.errors import LaeError, explained
 from lae_sim.forecast.base import AnyFactory, Forecaster, ImageSize, factory_for
 from lae_sim.replay.reach import (
@@ -63,10 +63,8 @@ loops were nearer to never. The weights leave the mean nearly alone, and widen t
 
 _NUMBER = re.compile(r"([0-9]+\.?[0-9]*|\.[0-9]+|inf)\Z")
 
-_TINY = float(np.finfo(np.float64).tiny)  # side of a box without a size: infinity times 0 is NaN
-_AS_LARGE = (
-    0.25  # log of the ratio of two gaps, up to which the outcome of one says that of the other
-)
+_LEAST_SIDE = 1e-9  # pixels; of a box without a size, since infinity times 0 is NaN
+_AS_LARGE = 0.25  # log of the ratio of two gaps up to which one says what comes of the other
 
 
 @dataclass(frozen=True)
@@ -257,7 +255,7 @@ class _Walk:
     def __init__(self, answers: RecordedAnswers, resumed: tuple[int, bool]) -> None:
         self._boxes, self._farther = answers.boxes, answers.farther
         self._middle = answers.boxes[:, :2] + answers.boxes[:, 2:] / 2
-        self._side = np.maximum(search_side(answers.boxes), _TINY)
+        self._side = np.maximum(search_side(answers.boxes), _LEAST_SIDE)
         self._offset = np.abs(np.diff(self._middle, axis=0)).max(axis=1, initial=0.0)
         self._resumed = resumed
 
@@ -304,11 +302,10 @@ def _forecast_walk(
     same_to = inf
     resumed_at, found = resumed
     for k, (frame, box) in enumerate(zip(frames[1:].tolist(), rows[1:]), 1):
-        x, y, w, h = forecaster.predict(frame)
+        predicted = forecaster.predict(frame)
         if keep_size:
-            *_, last_w, last_h = answered[-1]
-            x, y, w, h = x + (w - last_w) / 2, y + (h - last_h) / 2, last_w, last_h
-        centre_x, centre_y, w, h = search_region([x, y, w, h], image_size)
+            predicted = resized(predicted, answered[-1])
+        centre_x, centre_y, w, h = search_region(predicted, image_size)
         missed = k < resumed_at or (lost[-1] and k > resumed_at and not again)
         if not missed and (k > resumed_at or not found):
             offset = max(abs(box[0] + box[2] / 2 - centre_x), abs(box[1] + box[3] / 2 - centre_y))
@@ -357,9 +354,10 @@ def _resumed(recording: Recording, frames: Ints, jumps: Sequence[OwnJump]) -> tu
 
 
 def _recorded(recording: Recording, jump: OwnJump) -> bool:
-    """Whether the recording has the frames of the jump, and a box of the one after it."""
-    inside = len(jump.frames) > 0 and jump.frames[-1] < len(recording)
-    return bool(inside and np.isfinite(recording.boxes[jump.gap]).all())
+    """Whether the recording has boxes of all frames after the jump; it may be of fewer frames."""
+    if not len(jump.frames) or jump.frames[-1] >= len(recording):
+        return False
+    return bool(np.isfinite(recording.boxes.take(jump.frames, axis=0)).all())
 
 
 def _outcome(recording: Recording, jump: OwnJump) -> tuple[float, int | None]:
@@ -482,6 +480,7 @@ def phase_answers(
     for held in phases(stride, len(recording)):
         own = held[~seen[held] | (held == 0)]
         seen[own] = True
+        own = own[np.isfinite(recording.boxes[own, 0])]  # a real-time trace lacks some
         columns = [np.interp(frames, own, column) for column in recording.boxes[own].T]
         farther = np.diff(frames, prepend=0) > ceil(stride)
         answers.append(RecordedAnswers(np.stack(columns, axis=1), farther))

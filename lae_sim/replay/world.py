@@ -30,7 +30,7 @@ from lae_sim.replay.latency import (
     scaled,
     time_label,
 )
-from lae_sim.replay.reach import split_passes
+from lae_sim.replay.passes import split_passes
 from lae_sim.replay.run import Runs
 from lae_sim.replay.search import find_search, parse_search
 from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
@@ -139,11 +139,14 @@ class World:
         _check_kinds("latency", [self.latency], _PLUGIN, latency)
         traces = [*self.passes] if self.timing is None else [self.timing, *self.passes]
         _check_kinds("timing and passes", traces, _TRACE, _A_TRACE)
-        named("search", parse_search, text(self.search))
-        if self.pre_forecaster is not None and self.search == "off":
-            raise LaeError(
-                "pre_forecaster: what it is worth is the search model's: do not turn it off"
-            )
+        named("search", parse_search, named("search", text, self.search))
+        named("keep_size", flag, self.keep_size)
+        if self.pre_forecaster is not None:
+            named("pre_forecaster", text, self.pre_forecaster)
+            if self.search == "off":
+                raise LaeError(
+                    "pre_forecaster: what it is worth is the search model's: do not turn it off"
+                )
         if self.keep_size and self.pre_forecaster is None:
             raise LaeError("keep_size is a way to use a pre_forecaster")
         _check_kinds("convention", [self.convention], (str,), "a name, such as 'pysot'")
@@ -297,11 +300,18 @@ class World:
             sequences: those wanted; all by default.
             batch: schedule many sequences at once where policy and latency allow it (see
                 :func:`lae_sim.engine.lanes.batchable`). The runs are the same.
-            pre_forecaster: what the world's name of one stands for; without it, none is used.
+            pre_forecaster: what the world's name of one stands for (see
+                :func:`lae_sim.learning.registry.load_forecaster`).
 
         Raises:
-            LaeError: if a trace is missing or damaged, or the passes do not go together.
+            LaeError: if a trace is missing or damaged, the passes do not go together, or what the
+                name of a pre-forecaster stands for is not given.
         """
+        if self.pre_forecaster is not None and pre_forecaster is None:
+            raise LaeError(
+                f"pre_forecaster: give what {self.pre_forecaster!r} stands for, such as "
+                f"load_forecaster({self.pre_forecaster!r})"
+            )
         names = None if sequences is None else sequence_names(sequences)
         opened = open_trace(trace, names)
         strided, gaps = split_passes(map(open_trace, self.passes))

@@ -261,7 +261,7 @@ def _draw_curve(axes: Axes, report: ReachReport) -> None:
     if reach is not None:
         at = np.linspace(0, farthest, 400)
         axes.fill_between(at, *_band(reach, at), color=SKY_BLUE, alpha=0.35, lw=0, label="95 %")
-        label = f"reach {reach.centre:.2f} ± {1.81 * reach.spread:.2f}"
+        label = f"reach {reach.centre:.2f} ± {reach.deviation:.2f}"
         axes.plot(at, reach.found(at), color=BLUE, label=label)
     if bins:
         x, y = [each.distance for each in bins], np.array([each.share for each in bins])

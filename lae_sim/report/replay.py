@@ -122,14 +122,12 @@ def trace_report(
 def _scores(totals: ScoreTotals, forecasters: Sequence[str]) -> list[list[Report]]:
     """Mean scores, with the share of the latency loss recovered, by forecaster and sigma."""
     means = {metric: totals.mean(metric).tolist() for metric in METRICS}
-    won = {metric: totals.won(metric).tolist() for metric in RECOVERED}
-    lost = {metric: totals.lost(metric).tolist() for metric in RECOVERED}
 
     def one(f: int, s: int) -> Report:
         scores = {metric: _number(means[metric][f][s]) for metric in METRICS}
         comparable = totals.complete and forecasters[f] != "hold"
         for metric in RECOVERED:
-            share = recovered(won[metric][f][s], lost[metric][f][s]) if comparable else None
+            share = totals.changes(metric).recovered(f, s) if comparable else None
             scores[f"recovered_{metric}"] = share
         return scores
 
@@ -144,16 +142,14 @@ def _modelled(
     if totals.known is None:
         return None
     figures = totals.figures()
-    changes = {metric: totals.recovered(metric) for metric in MODELLED}
 
     def one(f: int, s: int) -> Report:
         scores: Report = {"c_known": totals.known}
+        scores |= {name: _number(values[f, s]) for name, values in figures.items()}
+        comparable = complete and forecasters[f] != "hold"
         for metric in MODELLED:
-            for name in (metric, f"{metric}_low", f"{metric}_high"):
-                scores[name] = _number(figures[name][f, s])
-            won, lost = (float(values[f, s]) for values in changes[metric])
-            comparable = complete and forecasters[f] != "hold"
-            scores[f"recovered_{metric}"] = recovered(won, lost) if comparable else None
+            share = totals.changes(metric).recovered(f, s) if comparable else None
+            scores[f"recovered_{metric}"] = share
         return {**scores, "lost_share": totals.lost_share}
 
     count = figures[MODELLED[0]].shape[1]
@@ -237,11 +233,9 @@ class SequenceRows:
         if not modelled.applies[i]:
             return None
         scores: Report = {"c_known": modelled.known}
+        scores |= {name: _number(values[f, i, s]) for name, values in modelled.figures().items()}
         for metric in MODELLED:
             mean = modelled.mean[metric][:, i, s]
-            scores[metric] = _number(mean[f])
-            scores[f"{metric}_low"] = _number(modelled.low[metric][f, i, s])
-            scores[f"{metric}_high"] = _number(modelled.high[metric][f, i, s])
             won, lost = mean[f] - mean[self._hold], part.offline[metric][i] - mean[self._hold]
             comparable = f != self._hold and math.isfinite(won + lost)
             share = recovered(float(won), float(lost)) if comparable else None
@@ -314,10 +308,9 @@ def summary_table(
             Column("recov.", f"recovered_{metric}", PERCENT),
         ]
         if any(result["modelled"] for report in reports for result in report["results"]):
-            columns += [
-                Column("modelled", partial(_modelled_of, metric), _SCORE),
-                Column("[low, high]", partial(_interval_of, metric)),
-            ]
+            columns.append(Column("modelled", partial(_modelled_of, metric), _SCORE))
+            if metric == "auc":  # that of DP would make the line too long
+                columns.append(Column("[low, high]", _interval_of))
     if any("mauc" in result for report in reports for result in report["results"]):
         columns += [Column("mAUC", "mauc", _SCORE), Column("mDP", "mdp", _SCORE)]
     columns += [
@@ -333,11 +326,12 @@ def _modelled_of(metric: str, line: Line) -> float | None:
     return score
 
 
-def _interval_of(metric: str, line: Line) -> str | None:
+def _interval_of(line: Line) -> str | None:
+    """The interval of the modelled AUC."""
     modelled = line["modelled"]
-    if not modelled or modelled[f"{metric}_low"] is None:
+    if not modelled or modelled["auc_low"] is None:
         return None
-    return f"[{modelled[f'{metric}_low']:.3f}, {modelled[f'{metric}_high']:.3f}]"
+    return f"[{modelled['auc_low']:.3f}, {modelled['auc_high']:.3f}]"
 
 
 def _change(metric: str, line: Line) -> float | None:
@@ -422,7 +416,7 @@ def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequenc
         Column("init", "init_ms", Number(".1f", unit=" ms")),
         Column("mismatch", lambda line: line["mismatch_sum"] / line["world_frames"], _FRAMES),
         Column("modelled AUC", partial(_modelled_of, "auc"), _SCORE),
-        Column("[low, high]", partial(_interval_of, "auc")),
+        Column("[low, high]", _interval_of),
         Column("approximate", "approximate_outputs"),
         Column("disagree", "disagreement", PERCENT),
     ]

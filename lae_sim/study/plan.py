@@ -15,7 +15,7 @@ from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import resolve_costs
 from lae_sim.learning.folds import Trainer
 from lae_sim.learning.registry import load_any, load_forecaster
-from lae_sim.replay.reach import passes_for
+from lae_sim.replay.passes import passes_for
 from lae_sim.replay.world import World, named
 from lae_sim.study.cells import Cell, Input, Setting, Task
 from lae_sim.study.spec import Study, is_random

@@ -15,10 +15,8 @@ from lae_sim._arrays import Floats
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import METRICS
-from lae_sim.evaluation.modelled import MODELLED
+from lae_sim.evaluation.modelled import FIGURES
 from lae_sim.trace.columns import from_numpy, from_texts
-
-_ENDS = ("", "_low", "_high")
 
 COLUMNS = {
     "trace": "string",
@@ -47,7 +45,7 @@ COLUMNS = {
     "failure_frame": "int32",
     **dict.fromkeys(METRICS, "float64"),
     **{f"offline_{metric}": "float64" for metric in METRICS},
-    **{f"modelled_{metric}{end}": "float64" for metric in MODELLED for end in _ENDS},
+    **{f"modelled_{name}": "float64" for name in FIGURES},
     "lost_share": "float64",
 }
 """Columns of the results, and their types.
@@ -121,12 +119,11 @@ class CellRows:
 
 def _modelled(part: Evaluation, f: int) -> dict[str, Floats]:
     """The modelled scores of a forecaster by sequence and sigma."""
-    modelled, columns = part.modelled, {}
-    for metric in MODELLED:
-        for end, values in zip(_ENDS, (modelled.mean, modelled.low, modelled.high)):
-            scores = np.where(modelled.applies[:, None], values[metric][f], np.nan)
-            columns[f"modelled_{metric}{end}"] = scores.ravel()
-    return columns
+    applies = part.modelled.applies[:, None]
+    return {
+        f"modelled_{name}": np.where(applies, values[f], np.nan).ravel()
+        for name, values in part.modelled.figures().items()
+    }
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> Any:

@@ -20,6 +20,7 @@ import pytest
 from matplotlib.figure import Figure
 from nasty import NASTY, nasty_traces
 from places import REPOSITORY, TRACES
+from restarted import gap_pass
 
 import lae_sim
 from lae_sim.api.evaluation import SETTING
@@ -332,6 +333,26 @@ def test_times_and_passes_may_be_open_traces() -> None:
     path = lae_sim.evaluate(SLOW, timing=FAST, scale=[1, 2])
     pd.testing.assert_frame_equal(opened.to_frame(), path.to_frame())
     assert opened.document()["traces"] == path.document()["traces"]
+
+
+def test_of_several_traces_each_pass_goes_with_its_own(tmp_path: Path) -> None:
+    slow = lae_sim.read_trace(SLOW)
+    gaps = gap_pass(slow.metadata, tmp_path / "slow.gaps.parquet")
+    result = lae_sim.evaluate([SLOW, FAST], passes=gaps, latency="constant:80ms")
+    known = [part["search"]["c_known"] for part in result.document()["traces"]]
+    assert known == [True, False]
+    about = {"tracker": {"name": "another"}, "dataset": slow.metadata.document["dataset"]}
+    other = gap_pass(lae_sim.Metadata.new("30", "every-frame", **about), tmp_path / "other.parquet")
+    with pytest.raises(lae_sim.LaeError, match="a pass is of another on synthetic: none of the"):
+        lae_sim.evaluate([SLOW, FAST], passes=other)
+
+
+def test_a_world_does_not_forget_its_pre_forecaster() -> None:
+    world = lae_sim.World.of(latency="constant:80ms", search="c=0.3", pre_forecaster="kalman")
+    with pytest.raises(lae_sim.LaeError, match="pre_forecaster: give what 'kalman' stands for"):
+        world.replay(SLOW)
+    runs = world.replay(SLOW, pre_forecaster=lae_sim.load_forecaster("kalman"))
+    assert all(run.modelled.forecast for run in runs)
 
 
 def test_a_result_may_be_gone_through_again(result: lae_sim.EvaluationResult) -> None:

@@ -61,8 +61,9 @@ def test_totals_of_groups_are_the_means_of_all(name: str, frames: int) -> None:
             counted = ~np.isnan(values + values[1] + offline[:, None])
             won = np.where(counted, values - values[1], 0).sum(axis=1)
             lost = np.where(counted, offline[:, None] - values[1], 0).sum(axis=1)
-            np.testing.assert_allclose(scores.won(metric), won, rtol=0, atol=1e-13)
-            np.testing.assert_allclose(scores.lost(metric), lost, rtol=0, atol=1e-13)
+            changes = scores.changes(metric)
+            np.testing.assert_allclose(changes.won.total, won, rtol=0, atol=1e-13)
+            np.testing.assert_allclose(changes.lost.total, lost, rtol=0, atol=1e-13)
     for f in range(2):
         curves = totals.curves.curves(f)
         for got, values in (

@@ -11,7 +11,6 @@ from lae_sim.replay.reach import (
     Restart,
     fit_reach,
     own_jumps,
-    passes_for,
     restarts_of,
 )
 from lae_sim.trace.file import Trace
@@ -206,18 +205,3 @@ def test_names_are_read_as_they_were_written(sequence, start, gap):
 def test_other_names_are_no_restarts(name):
     with pytest.raises(LaeError, match="SEQUENCE@START"):
         RestartName.parse(name)
-
-
-def of(tracker, dataset, kind="every-frame"):
-    return Trace(Metadata.new("30", kind, tracker={"name": tracker}, dataset=dataset), [])
-
-
-def test_passes_go_with_the_traces_of_their_tracker_and_dataset():
-    traces = [of("a", "D"), of("b", "D"), of("a", "E"), of("a", "D")]
-    passes = [of("a", "D", "restarts"), of("a", "E"), of("a", "D")]
-    first, second, third = passes
-    assert passes_for(traces, passes) == [(first, third), (), (second,), (first, third)]
-    assert passes_for(traces[1:2], passes) == [(first, second, third)]  # whatever they say
-    assert passes_for(traces, []) == [()] * 4
-    with pytest.raises(LaeError, match="a pass is of c on D: none of the traces is of the same"):
-        passes_for(traces, [*passes, of("c", "D")])

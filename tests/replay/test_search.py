@@ -20,7 +20,13 @@ from lae_sim.forecast.kalman import Kalman
 from lae_sim.replay.latency import constant
 from lae_sim.replay.reach import OwnJump, Reach
 from lae_sim.replay.run import Runs, replay_sequence
-from lae_sim.replay.search import RecordedAnswers, SearchModel, find_search, parse_search
+from lae_sim.replay.search import (
+    RecordedAnswers,
+    SearchModel,
+    find_search,
+    parse_search,
+    phase_answers,
+)
 from lae_sim.replay.strides import phases
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
@@ -113,6 +119,15 @@ def test_a_pre_forecaster_says_where_to_search(walk, c, keep_size):
     found = ahead.outcomes(recording, frames, recorded(recording, frames))
     expected = plain_forecast(frames, recording.boxes[frames], c, keep_size)
     np.testing.assert_allclose(found.boxes[0], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_pre_forecaster_that_fails_is_named():
+    def broken(box, image_size):
+        raise ZeroDivisionError("no motion")
+
+    recording, frames = straight(), np.array([0, 2])
+    with pytest.raises(LaeError, match="the pre-forecaster: ZeroDivisionError: no motion"):
+        model(1, pre_forecaster=broken).outcomes(recording, frames, recorded(recording, frames))
 
 
 @settings(max_examples=100, deadline=None)
@@ -355,8 +370,8 @@ def test_jumps_to_frames_without_a_recorded_box_say_nothing():
     assert np.array_equal(found.boxes[0], recording.boxes[frames])
 
 
-def test_jumps_beyond_the_end_of_a_recording_say_nothing():
-    recording = straight(25)
+def test_jumps_beyond_the_end_of_a_shorter_recording_say_nothing():
+    recording = straight(30)
     frames = np.array([0, 21, 22])
     jumps = {"a": [jump(straight(), gap, None) for gap in (20, 40)]}
     found = model(50, jumps=jumps).outcomes(recording, frames, recorded(recording, frames))
@@ -421,6 +436,26 @@ def test_gap_passes_that_show_no_reach_are_said_to_show_none():
     assert find_search("trace", EVERY).source == "c is unknown, 0.6 to 1 assumed"
 
 
+@pytest.mark.parametrize("size", [(0, 0), (-10, 10), (-10, -10)])
+def test_around_an_answer_without_a_size_nothing_is_found(size):
+    recording = straight()
+    recording.boxes[2, 2:] = size
+    frames = np.array([0, 2, 4, 6])
+    narrow, boundless = (
+        model(0.5, inf).outcomes(recording, frames, recorded(recording, frames)).boxes
+    )
+    assert np.array_equal(narrow, recording.boxes[[0, 2, 2, 2]])
+    assert np.array_equal(boundless, recording.boxes[frames])
+
+
+def test_the_phases_of_a_real_time_trace_are_of_the_frames_that_it_has():
+    recording = straight()
+    recording.boxes[1::2] = np.nan
+    frames = np.arange(0, 40)
+    (answers,) = phase_answers(Fraction(1), recording, frames, weight=1.0)
+    np.testing.assert_allclose(answers.boxes, straight().boxes[frames])
+
+
 # ------------------------------------------------------------------------------- what is asked for
 
 
@@ -429,6 +464,8 @@ def test_exact_replays_are_not_modelled():
     search = model(0.1)
     assert replay_sequence(recording, CLOCK, constant("10ms"), search=search).modelled is None
     assert replay_sequence(recording, CLOCK, constant("47ms")).modelled is None
+    ahead = model(0.1, pre_forecaster=Kalman)
+    assert replay_sequence(recording, CLOCK, constant("10s"), search=ahead).modelled is None
     assert replay_sequence(recording, CLOCK, constant("47ms"), search=search).modelled is not None
     real_time = simulate(len(recording), CLOCK, lambda frame: 47_000_000, latest)
     left = Recording.of_run("a", real_time, recording.boxes[real_time.frames], recording.truth)
