@@ -159,6 +159,7 @@ def test_a_sweep_of_the_initialisation_is_the_single_replays(tmp_path: Path) -> 
         tmp_path, latencies=("bootstrap", "constant:20ms"), init=("0s", "1s"), repetitions=2, seed=5
     )
     table = results.to_frame().set_index(["trace", "latency", "forecaster", "repetition"])
+    table = table.sort_index(kind="stable")
     for latency, named in (
         ("constant:20ms,init=1s", "constant:20ms,init=1s"),
         ("constant:20ms,init=0s", "constant:20ms,init=0s"),
