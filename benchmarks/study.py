@@ -28,7 +28,7 @@ from lae_sim import Metadata, Recording, Trace, replay_trace, simulate, write_tr
 from lae_sim.engine import Times, latest, simulate_lanes
 from lae_sim.evaluation import evaluate_groups
 from lae_sim.forecast import Hold
-from lae_sim.replay import bootstrap, replay_repeated
+from lae_sim.replay import Runs, bootstrap, replay_repeated
 from lae_sim.report.table import aligned
 
 RATES = (15, 20, 25, 30, 40, 50, 60, 90)  # frames/s of the trackers
@@ -195,7 +195,8 @@ def lane_lines(rounds: int) -> list[list[str]]:
     metadata = Metadata.new("30", "every-frame")
     trace = Trace(metadata, list(recordings(lengths())))
     source = bootstrap(0)
-    drawn = replay_trace(trace, latency=source)
+    drawn = replay_trace(trace, latency=source, search="off")
+    modelled = replay_trace(trace, latency=source, search="c=0.7")
     every = [
         Times(recording.name, ns, by_call=True)
         for recording in trace
@@ -212,8 +213,8 @@ def lane_lines(rounds: int) -> list[list[str]]:
     def runs() -> Iterator[tuple[int, object]]:
         return replay_repeated(drawn, REPETITIONS)
 
-    def scored() -> None:
-        those = (run for _, run in replay_repeated(drawn, REPETITIONS))
+    def scored(replays: Runs) -> None:
+        those = (run for _, run in replay_repeated(replays, REPETITIONS))
         for _ in evaluate_groups(those, metadata, {"hold": Hold}, (Fraction(0),), frames=1 << 17):
             pass
 
@@ -225,7 +226,8 @@ def lane_lines(rounds: int) -> list[list[str]]:
         "SimPy, schedule alone": simpy,
         "schedule alone": lambda: exhaust(lambda: simulate_lanes(sizes, CLOCK, every, latest)),
         "and bootstrap's draws, boxes": lambda: exhaust(runs),
-        "and scores, hold": scored,
+        "and scores, hold": lambda: scored(drawn),
+        "and the search model, c = 0.7": lambda: scored(modelled),
     }
     taken = medians(works, rounds)
     speed = {
