@@ -264,8 +264,9 @@ class Runs:
 
     def __post_init__(self) -> None:
         if self.trace.metadata.kind == "restarts":
+            name = getattr(self.trace.recordings, "path", self.trace)
             raise LaeError(
-                f"{self.trace!r} is a gap pass, which measures a tracker's reach: "
+                f"{name}: a gap pass, which measures a tracker's reach: "
                 "give it to --strided (passes) of a trace of every frame"
             )
         if self.times.metadata.kind == "restarts":
