@@ -195,6 +195,7 @@ def convert_results(
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
             *annotations.files.values(),
+            *((given.file,) if given and given.file else ()),
         ],
     )
     return Trace(metadata, recordings), summary
