@@ -103,6 +103,11 @@ def start(here: Path, *arguments: str, module: str = "profile", **more: Any) -> 
     )
 
 
+def heed_ctrl_c() -> None:
+    """In a child: not to ignore Ctrl-C where the tests run in the background of a shell."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def profile(here: Path, *arguments: str, status: int = 0, **more: Any) -> tuple[str, str]:
     process = start(here, *arguments, **more)
     out, err = process.communicate(timeout=120)
@@ -273,7 +278,7 @@ def test_kill_and_resume(here: Path) -> None:
 def test_ctrl_c_keeps_what_is_complete(here: Path) -> None:
     waits = ("--option", "fail_at=1", "how=wait")  # in the second sequence, until told to go on
     options = (*MINE, *waits, "--out", "t.parquet", "--warmup", "0", "--frame-timeout", "600s")
-    process = start(here, *options, start_new_session=True)
+    process = start(here, *options, start_new_session=True, preexec_fn=heed_ctrl_c)
     deadline = time.monotonic() + 60
     while not list(here.glob("t.unfinished/first/[!.]*.parquet")) and time.monotonic() < deadline:
         time.sleep(0.01)
