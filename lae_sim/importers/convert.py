@@ -276,7 +276,10 @@ def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | No
             )
         return results.elapsed_ns
     if results.mean_fps is not None:
-        return np.full(count, frame_ns(results.mean_fps), np.int64)
+        try:
+            return np.full(count, frame_ns(results.mean_fps), np.int64)
+        except LaeError as error:
+            raise LaeError(f"{source.path}: {error}") from error
     raise LaeError(f"{source.path}: the results hold no times; {NO_TIMES}")
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.numbers import read_durations, read_numbers
-from lae_sim.engine.clock import parse_duration, parse_fps, split_init
+from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
 from lae_sim.errors import LaeError
 from lae_sim.importers.matlab import load_matlab
 
@@ -133,8 +133,12 @@ def given_times(text: str, tracker: str) -> GivenTimes | None:
 
 
 def frame_ns(fps: Fraction) -> int:
-    """The time of one frame at a mean rate, ns, rounded half to even."""
-    return round(10**9 / fps)
+    """The time of one frame at a mean rate, ns, rounded half to even.
+
+    Raises:
+        LaeError: if a frame takes too long.
+    """
+    return fitting(round(10**9 / fps), f"a mean of {float(fps):g} fps")
 
 
 def find_results(path: Path, wanted: str = "auto", repetition: int = 1) -> tuple[str, list[Source]]:

@@ -116,6 +116,22 @@ def test_the_first_frame_of_each_sequence_takes_what_the_initialisation_does(wor
             assert set(others) == {frame_ns}
 
 
+def test_times_beyond_64_bits_are_refused(world, convert):
+    (world / "f.csv").write_text("sequence,fps\na,0.000000000001\nb,20\n")
+    for option in ("constant:999999999999s", "constant:47ms,init=999999999999s",
+                   "mean-fps:0.000000000001", f"mean-fps:{world / 'f.csv'}"):  # fmt: skip
+        status, _, error = convert("KCF", "--time", option)
+        assert status == 2
+        assert "too long a time" in error
+    for name in "ab":
+        path = world / "ECO" / f"{name}.mat"
+        path.parent.mkdir(exist_ok=True)
+        scipy.io.savemat(path, {"res": TRUTH, "fps": 1e-300})
+    status, _, error = convert("ECO")
+    assert status == 2
+    assert "a.mat: a mean of 1e-300 fps: too long a time" in error
+
+
 def test_mat_results(world, convert):
     for name, fps in (("a", 25.0), ("b", 50.0)):
         path = world / "mat" / f"{name}_ECO.mat"
