@@ -199,6 +199,7 @@ def exit_status(work: Callable[[], None], program: str) -> int:
     An error is one or two lines on the standard error stream, without a traceback. Work prints when
     it has written its files: that nobody reads what it prints is no error.
     """
+    _occupy_closed_streams()
     try:
         work()
         if sys.stdout is not None:
@@ -213,6 +214,18 @@ def exit_status(work: Callable[[], None], program: str) -> int:
         tell(f"{program}: error: {error}")
         return 2
     return 0
+
+
+def _occupy_closed_streams() -> None:
+    """Let no file be opened under the number of a closed stream: what others print would go there.
+
+    ``print`` itself writes nothing where a stream was closed when Python started.
+    """
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
 
 
 def _reader_gone(stream: TextIO) -> bool:

@@ -219,7 +219,8 @@ def test_another_pipe_that_breaks_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no sh")
 @pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
 def test_closed_streams_change_no_status(closed: str, tmp_path: Path) -> None:
-    for command, status in ((f"replay {SLOW} --json", 0), ("replay no.parquet", 2)):
+    profile = "profile --sequence race --out out.parquet"  # whose worker takes over descriptors
+    for command, status in ((f"replay {SLOW} --json", 0), ("replay no.parquet", 2), (profile, 0)):
         shell = f"exec {sys.executable} -m lae_sim {command} {closed}"
         done = subprocess.run(
             ["sh", "-c", shell],
