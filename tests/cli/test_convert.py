@@ -86,6 +86,7 @@ def test_json(world, convert):
         "frames": 6,
         "processed": 6,
         "median_ms": 20.0000005,
+        "row_0_from_truth": [],
         "without_truth": [],
         "without_results": [],
     }
