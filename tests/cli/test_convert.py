@@ -194,6 +194,25 @@ def test_truth_without_results(world, convert):
     assert "Without results: z." in convert("KCF")[1]
 
 
+def test_a_row_0_in_another_scale_is_said(world, convert):
+    write(world / "KCF" / "a.txt", [TRUTH[0] * 1.9, *TRUTH[1:]])
+    status, out, _ = convert("KCF")
+    assert status == 0
+    assert (
+        "Row 0 is not the initial box in 1 of 2 sequences (a); there the trace starts from" in out
+    )
+    assert read_trace(world / "t.parquet")["a"].boxes.tolist() == TRUTH.tolist()
+
+
+def test_boxes_by_centre_are_refused(world, convert):
+    write(world / "KCF" / "b.txt", TRUTH + [[w / 2, h / 2, 0, 0] for *_, w, h in TRUTH])
+    status, _, err = convert("KCF")
+    assert status
+    assert "sequence 'b'" in err
+    assert "looks like boxes by centre (cx, cy, w, h): mean IoU 0.1" in err
+    assert "--exclude b" in err
+
+
 def test_lengths_are_checked(world, convert):
     write(world / "KCF" / "a.txt", TRUTH[:5])
     _, _, err = convert("KCF")
