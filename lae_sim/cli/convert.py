@@ -145,6 +145,12 @@ def _text(summary: ConversionSummary, out: Path) -> str:
     ]
     if "note" in summary.timing:
         lines.append(f"Note: {summary.timing['note']}.")
+    if summary.row_0_from_truth:
+        lines.append(
+            f"Row 0 is not the initial box in {len(summary.row_0_from_truth)} of "
+            f"{summary.sequences} sequences ({listed(summary.row_0_from_truth)}); there the trace "
+            "starts from the truth, as the tracker did."
+        )
     if summary.without_truth:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:

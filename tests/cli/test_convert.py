@@ -86,6 +86,7 @@ def test_json(world, convert):
         "frames": 6,
         "processed": 6,
         "median_ms": 20.0000005,
+        "row_0_from_truth": [],
         "without_truth": [],
         "without_results": [],
     }
@@ -207,6 +208,25 @@ def test_missing_truth(world, convert):
 def test_truth_without_results(world, convert):
     write(world / "D" / "anno" / "z.txt", TRUTH)
     assert "Without results: z." in convert("KCF")[1]
+
+
+def test_a_row_0_in_another_scale_is_said(world, convert):
+    write(world / "KCF" / "a.txt", [TRUTH[0] * 1.9, *TRUTH[1:]])
+    status, out, _ = convert("KCF")
+    assert status == 0
+    assert (
+        "Row 0 is not the initial box in 1 of 2 sequences (a); there the trace starts from" in out
+    )
+    assert read_trace(world / "t.parquet")["a"].boxes.tolist() == TRUTH.tolist()
+
+
+def test_boxes_by_centre_are_refused(world, convert):
+    write(world / "KCF" / "b.txt", TRUTH + [[w / 2, h / 2, 0, 0] for *_, w, h in TRUTH])
+    status, _, err = convert("KCF")
+    assert status
+    assert "sequence 'b'" in err
+    assert "looks like boxes by centre (cx, cy, w, h): mean IoU 0.1" in err
+    assert "--exclude b" in err
 
 
 def test_lengths_are_checked(world, convert):
