@@ -131,7 +131,7 @@ class Evaluation:
         staleness: how old the answers are, where forecasts cost nothing.
         scores: per metric of ``METRICS``, float64 [F, S, M] in 0..1; NaN = leaves the mean.
         failure: the first world frame whose answer does not overlap the truth at all, int64
-            [F, S, M]; the number of world frames if there is none.
+            [F, S, M]; the number of world frames if there is none, -1 without a truth to score by.
         curves: at one permitted latency, [F, S, ...].
         offline: per metric, of the trace's boxes at their own frames, float64 [S]; NaN where the
             trace does not hold every frame.

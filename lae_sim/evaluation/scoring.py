@@ -53,8 +53,8 @@ class Scorer:
         if convention.leaves_out:
             valid = convention.valid_success(self._truth.T)
             counted = np.add.reduceat(valid.astype(np.int64), self._bases)
-        scored = np.array([is_scored(recording.truth) for recording in recordings])
-        self._counted = np.where(scored & (counted > 0), counted, np.nan)
+        self._is_scored = np.array([is_scored(recording.truth) for recording in recordings])
+        self._counted = np.where(self._is_scored & (counted > 0), counted, np.nan)
 
     def of(
         self, parts: Iterable[tuple[Histories, Pairs, Floats]], count: int, curves_at: int = 0
@@ -93,6 +93,7 @@ class Scorer:
                 truth = self._truth.take(self._bases[sequence[now]] + some.frame, axis=1).T
                 counts = frame_counts(truth, boxes[now], some.frame, self._convention)
                 tally.add(sequence[now], some, counts)
+        tally.failure[~self._is_scored] = -1
         thresholds = {"auc": self._convention.thresholds, "norm_auc": len(NORM_THRESHOLDS)}
         counted = self._counted[:, None]
         scores = {m: tally.sums[m] / (counted * thresholds.get(m, 1)) for m in METRICS}

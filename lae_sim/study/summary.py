@@ -355,11 +355,12 @@ def _staleness(scores: Scores, s: int) -> Staleness:
     if s:
         return staleness
     failure = scores.repeated["failure_frame"]
-    failed = failure < frames
-    median = _median_survival(failure.ravel(), failed.ravel())
+    scored = failure >= 0
+    failed = (failure < frames)[scored]
+    median = _median_survival(failure[scored], failed)
     return replace(
         staleness,
-        failed=float(failed.mean()),
+        failed=float(failed.mean()) if len(failed) else None,
         time_to_failure_ms=None if median is None else median * frame_ms,
     )
 

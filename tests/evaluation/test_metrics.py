@@ -116,6 +116,7 @@ def test_no_score_without_a_truth(name: str, truth: list[list[float]]) -> None:
     assert np.isnan(found.curves.success).all()
     assert np.isnan(found.curves.precision).all()
     assert found.replay.scored.tolist() == [False]
+    assert found.failure.tolist() == [[[-1]]]
 
 
 @EVERY
