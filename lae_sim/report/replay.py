@@ -399,7 +399,7 @@ def attribute_table(
     lines = [
         line.new_child({**scores, "label": name})
         for line in _lines([("", report)], shown_sigmas)
-        for name, scores in line["attributes"].items()
+        for name, scores in line.get("attributes", {}).items()
     ]
     return _text(columns, sorted(lines, key=itemgetter("label")), "attribute", swept)
 

@@ -452,6 +452,10 @@ def test_a_video_without_truth_has_no_score(tmp_path, convention, options):
     assert "1 of 1 sequences have no ground truth after the first frame" in " ".join(out.split())
 
 
+def test_attributes_that_there_are_not_make_an_empty_table():
+    assert "AUC" in replay(SLOW, "--sequence", "boat-calm", "--attributes")
+
+
 def test_stalls_of_skipped_frames_are_said(tmp_path):
     [one] = lae_sim.read_trace(FAST, ["boat-calm"])
     one.elapsed_ns[1] = 14_000_000_000  # the initialisation takes longer than a frame
