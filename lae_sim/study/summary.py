@@ -157,7 +157,8 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
             np.array([place[name] for name in of_entry]), column("repetition")[::count],
         ))  # fmt: skip
         shape = (cell.setting.count, len(names), count)
-        here = np.logical_or.reduce(~exact[::count][order].reshape(shape[:2]))
+        modelled_here = ~exact & (column("failure_frame") >= 0)  # and scored
+        here = np.logical_or.reduce(modelled_here[::count][order].reshape(shape[:2]))
         applies = here if applies is None else np.logical_or(applies, here)
         for name in wanted:
             values = column(name).reshape(entries, count)[order].reshape(shape)
