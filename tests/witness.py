@@ -289,8 +289,14 @@ def scores(
     passed = [0] * (steps + 1)
     near = [0] * 51
     counted = 0
+    if all(box is None or min(box[2:]) <= 0 for box in truth[1:] or truth):
+        return {"auc": None, "dp20": None}  # there is no more than the initial box
+    before: Box = answers[0]
     for i, (true, answer) in enumerate(zip(truth, answers)):
         box = None if true is None else [number(v) for v in true]
+        if convention == "otb" and not (all(map(math.isfinite, answer)) and min(answer[2:]) > 0):
+            answer = before
+        before = answer
         told = [number(v) for v in answer]
         if convention == "otb" and i == 0 and box is not None:
             told = box
@@ -309,7 +315,10 @@ def scores(
             iou = overlap(box, told)
             for k in range(steps + 1):
                 passed[k] += iou > number(k) / steps
-        ok = box is not None and (leaves_out or min(_centre(box)) > 0)
+        if leaves_out or convention == "otb":
+            ok = valid
+        else:
+            ok = box is not None and min(_centre(box)) > 0
         for pixels in range(51):
             if not ok:
                 near[pixels] += 1

@@ -168,10 +168,12 @@ class ComparisonResult:
         return "\n\n".join([comparison_table(self.summary), *self.notes])
 
     def __repr__(self) -> str:
+        from lae_sim.report.table import FINE_SCORE, METRIC_LABELS
+
         table = self.summary[self.summary["metric"] == self.metrics[0]]
         first = table.drop_duplicates("forecaster")
-        scores = ", ".join(f"{row.forecaster} {row.mean:.4f}" for row in first.itertuples())
-        score = "modelled AUC" if self.ranking.modelled else "AUC"
+        scores = ", ".join(f"{row.forecaster} {FINE_SCORE(row.mean)}" for row in first.itertuples())
+        score = METRIC_LABELS[self.metrics[0]]
         setting = f"{first['trace'].iloc[0]}, {first['latency'].iloc[0]}"
         more = len(table.drop_duplicates(["trace", "latency", "scale", "sigma"])) - 1
         setting += f" and {more} more" * bool(more)

@@ -43,6 +43,7 @@ from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import TraceLike, World, label_of, named, open_others, open_trace
 from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
+from lae_sim.report.table import FINE_SCORE
 from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
 
@@ -418,7 +419,7 @@ class EvaluationResult:
         first, count = self.parts[0], len(self.parts)
         rows = self.summary.head(len(first.scenario.forecasters) * len(first.scenario.world.sigmas))
         rows = rows.drop_duplicates("forecaster")
-        scores = ", ".join(f"{row.forecaster} {row.auc:.4f}" for row in rows.itertuples())
+        scores = ", ".join(f"{row.forecaster} {FINE_SCORE(row.auc)}" for row in rows.itertuples())
         more = f" and {count - 1} more" if count > 1 else ""
         setting = f"{first.scenario.label}, {first.scenario.world.label()}"
         return " ".join(f"<EvaluationResult of {setting}{more}: AUC {scores}>".split())

@@ -86,15 +86,16 @@ def notes_on(
     """What to say of the scores of a trace, a sentence each."""
     notes = []
     sequences = replay.sequences
-    bare = [n for n, i, t in zip(sequences, replay.frames, replay.truthless) if i == t]
-    if replay.truthless.any():
+    bare = [name for name, scored in zip(sequences, replay.scored) if not scored]
+    if bare:
+        notes.append(
+            f"{len(bare)} of {len(sequences)} sequences have no ground truth after the first frame "
+            f"and are not scored, such as {bare[0]!r}"
+        )
+    if truthless := replay.truthless[replay.scored].sum():
         counted = "leaves them out" if convention.leaves_out else "counts them as missed by AUC"
         counted += "" if convention.leaves_out else " and hit by DP"
-        notes.append(
-            f"{replay.truthless.sum():,} frames have no ground truth; {convention.name} "
-            + counted
-            + (f"; {len(bare)} sequences have none at all, such as {bare[0]!r}" if bare else "")
-        )
+        notes.append(f"{truthless:,} frames have no ground truth; {convention.name} {counted}")
     if replay.missing.any():
         which = "the trace lacks" if replay.missing.all() else "some sequences lack"
         notes.append(f"no offline score, nothing recovered: {which} the boxes of skipped frames")

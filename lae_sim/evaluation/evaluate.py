@@ -14,7 +14,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import search_distance
 from lae_sim.errors import LaeError, explained, shown
-from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention
+from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention, is_scored
 from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_scores
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scored, Scorer
@@ -40,6 +40,7 @@ class ReplayStatistics:
         sequences: names, S of them.
         frames: world frames of each, int64 [S].
         truthless: world frames of each that have no ground truth, int64 [S].
+        scored: whether each has a truth to score by (:func:`.metrics.is_scored`), bool [S].
         missing: world frames of each without a box in the trace, int64 [S].
         processed: processed frames of each, int64 [S].
         scores_latency: see :class:`lae_sim.engine.scheduler.Schedule`, bool [S].
@@ -56,6 +57,7 @@ class ReplayStatistics:
     sequences: tuple[str, ...]
     frames: Ints
     truthless: Ints
+    scored: Bools
     missing: Ints
     processed: Ints
     scores_latency: Bools
@@ -129,7 +131,7 @@ class Evaluation:
         staleness: how old the answers are, where forecasts cost nothing.
         scores: per metric of ``METRICS``, float64 [F, S, M] in 0..1; NaN = leaves the mean.
         failure: the first world frame whose answer does not overlap the truth at all, int64
-            [F, S, M]; the number of world frames if there is none.
+            [F, S, M]; the number of world frames if there is none, -1 without a truth to score by.
         curves: at one permitted latency, [F, S, ...].
         offline: per metric, of the trace's boxes at their own frames, float64 [S]; NaN where the
             trace does not hold every frame.
@@ -293,12 +295,13 @@ class _Offline:
     """What is scored of a recording alone, however it is replayed.
 
     Attributes:
-        truthless, missing: see :class:`ReplayStatistics`.
+        truthless, scored, missing: see :class:`ReplayStatistics`.
         scores: in the order of ``METRICS``.
         success, precision: see :class:`Curves`.
     """
 
     truthless: int
+    scored: bool
     missing: int
     scores: Sequence[float]
     success: Floats
@@ -315,10 +318,14 @@ def _offline(
         offline = Scorer(new, convention).offline()
         scores = np.stack([offline.scores[metric][:, 0] for metric in METRICS], axis=1).tolist()
         for r, recording in enumerate(new):
-            truth, boxes = recording.truth[:, 0], recording.boxes[:, 0]
-            missing = int(np.isnan(truth).sum()), int(np.isnan(boxes).sum())
-            curves = offline.success[r], offline.precision[r]
-            scored[recording] = _Offline(*missing, scores[r], *curves)
+            scored[recording] = _Offline(
+                truthless=int(np.isnan(recording.truth[:, 0]).sum()),
+                scored=is_scored(recording.truth),
+                missing=int(np.isnan(recording.boxes[:, 0]).sum()),
+                scores=scores[r],
+                success=offline.success[r],
+                precision=offline.precision[r],
+            )
     return {recording: value for recording, value in scored.items() if value is not None}
 
 
@@ -431,6 +438,7 @@ def _replay_statistics(
         sequences=tuple(run.recording.name for run in runs),
         frames=pairing.lengths,
         truthless=np.array([each.truthless for each in offline], np.int64),
+        scored=np.array([each.scored for each in offline]),
         missing=np.array([each.missing for each in offline], np.int64),
         processed=np.diff(pairing.offsets),
         scores_latency=np.array([run.schedule.scores_latency for run in runs]),

@@ -5,7 +5,7 @@ t. Precision: the share of frames whose centre error is <= t pixels; DP is at 20
 precision (Mueller et al., TrackingNet 2018): the error over the truth's width and height, at 0.20,
 and the mean over 0, 0.01, ..., 0.50. With strict IoU > t and t up to 1, a perfect tracker's AUC is
 20/21. Toolkits disagree on frames without a valid truth, by up to 30 points on the same boxes, so
-each convention has a name.
+each convention has a name. None of them scores a sequence without any truth.
 """
 
 from __future__ import annotations
@@ -34,17 +34,23 @@ class Convention:
         valid: the truth counts for success if ``"size"`` (w > 0 and h > 0), ``"positive"`` (all of
             x, y, w, h > 0) or ``"finite"`` (no NaN).
         leaves_out: frames without a valid truth leave both metrics. Otherwise they are misses of
-            success, and *hits* of precision where the truth's centre is not > 0 in x and y.
+            success, and *hits* of precision.
+        by_centre: the truth counts for precision where its centre is > 0 in x and y. Otherwise, and
+            where frames are left out, it counts where it does for success.
         thresholds: number of IoU thresholds, evenly spaced from 0 to 1.
         first_frame_is_truth: the answer for frame 0 is replaced by the truth.
+        keeps_answer: an answer that is not finite or has no positive size takes the one for the
+            frame before.
         drops_zeros: sequences whose curve is 0 everywhere leave the mean over sequences.
     """
 
     name: str
     valid: Literal["size", "positive", "finite"]
     leaves_out: bool = False
+    by_centre: bool = True
     thresholds: int = 21
     first_frame_is_truth: bool = False
+    keeps_answer: bool = False
     drops_zeros: bool = False
 
     @property
@@ -63,9 +69,21 @@ class Convention:
 
     def valid_precision(self, truth: Floats) -> Bools:
         """Where the truth counts for precision, bool [n]."""
-        if self.leaves_out:
+        if self.leaves_out or not self.by_centre:
             return self.valid_success(truth)
         return _all(centre(truth) > 0)
+
+    def kept(self, answers: Floats) -> Ints:
+        """Which answer counts for each frame of one sequence, int64 [T].
+
+        Args:
+            answers: for every world frame, float64 [T, 4].
+        """
+        frames = np.arange(len(answers))
+        if not self.keeps_answer:
+            return frames
+        # calcSeqErrRobust.m of the OTB toolkit, before it replaces the first answer by the truth
+        return np.maximum.accumulate(np.where(is_box(answers), frames, 0))
 
 
 CONVENTIONS = {
@@ -73,7 +91,14 @@ CONVENTIONS = {
     for convention in (
         Convention("pysot", "size"),
         Convention("elae", "positive"),
-        Convention("otb", "positive", first_frame_is_truth=True, drops_zeros=True),
+        Convention(
+            "otb",
+            "positive",
+            by_centre=False,
+            first_frame_is_truth=True,
+            keeps_answer=True,
+            drops_zeros=True,
+        ),
         Convention("got10k", "finite", leaves_out=True),
         Convention("got10k-101", "finite", leaves_out=True, thresholds=101),
         Convention("exclude", "size", leaves_out=True),
@@ -104,6 +129,23 @@ def find_convention(name: str) -> Convention:
         known = ", ".join(CONVENTIONS) + hint(name, CONVENTIONS)
         raise LaeError(f"no convention {shown(name)}: there are {known}")
     return CONVENTIONS[name]
+
+
+def is_scored(truth: Floats) -> bool:
+    """Whether a sequence has a truth to score by: one on any frame after the first.
+
+    The first may be no more than the box that initialises the tracker, as of a video or of a test
+    set whose annotations are held back. A sequence of one frame is scored by it.
+
+    Args:
+        truth: of every world frame, float64 [T, 4]; NaN, or of no size, is none.
+    """
+    return bool(_all(truth[min(1, len(truth) - 1) :, 2:] > 0).any())
+
+
+def is_box(boxes: Floats) -> Bools:
+    """Where boxes are finite and have a positive size, bool [n]."""
+    return _all(np.isfinite(boxes)) & _all(boxes[:, 2:] > 0)
 
 
 METRICS = ("auc", "dp20", "norm_dp20", "norm_auc")
@@ -206,27 +248,37 @@ def _length(x: Floats, y: Floats) -> Floats:
 def success_curve(truth: Floats, answers: Floats, convention: Convention) -> Floats:
     """Success over the convention's IoU thresholds for one sequence, float64 [thresholds].
 
+    It is NaN without a truth to score by (:func:`is_scored`).
+
     Args:
         truth, answers: boxes of every world frame, float64 [T, 4].
     """
+    answers = answers[convention.kept(answers)]
     counts = frame_counts(truth, answers, np.arange(len(truth)), convention)
-    scored = convention.valid_success(truth) if convention.leaves_out else np.ones(len(truth), bool)
-    passed = counts.success[scored, None] > np.arange(convention.thresholds)
-    curve: Floats = passed.sum(axis=0) / (scored.sum() or np.nan)
-    return curve
+    passed = counts.success[:, None] > np.arange(convention.thresholds)
+    return _shares(passed, convention.valid_success(truth), truth, convention)
 
 
 def precision_curve(truth: Floats, answers: Floats, convention: Convention) -> Floats:
     """Precision over 0, 1, ..., 50 px for one sequence, float64 [51].
 
+    It is NaN without a truth to score by (:func:`is_scored`).
+
     Args:
         truth, answers: boxes of every world frame, float64 [T, 4].
     """
+    answers = answers[convention.kept(answers)]
     if convention.first_frame_is_truth:
         answers = np.concatenate([truth[:1], answers[1:]])
     valid = convention.valid_precision(truth)
     error = np.where(valid, _length(*(centre(answers) - centre(truth)).T), -1.0)
+    return _shares(error[:, None] <= CENTRE_THRESHOLDS, valid, truth, convention)
+
+
+def _shares(passed: Bools, valid: Bools, truth: Floats, convention: Convention) -> Floats:
+    """The share of the frames that count which passed each threshold, from bool [T, N]."""
     if convention.leaves_out:
-        error = error[valid]
-    curve: Floats = (error[:, None] <= CENTRE_THRESHOLDS).sum(axis=0) / (len(error) or np.nan)
-    return curve
+        passed = passed[valid]
+    scored = len(passed) > 0 and is_scored(truth)
+    shares: Floats = passed.sum(axis=0) / (len(passed) if scored else np.nan)
+    return shares

@@ -20,6 +20,8 @@ from lae_sim.evaluation.metrics import (
     Convention,
     FrameCounts,
     frame_counts,
+    is_box,
+    is_scored,
 )
 from lae_sim.evaluation.pairing import Histories, Pairs, ranges
 from lae_sim.trace.recording import Recording
@@ -51,7 +53,8 @@ class Scorer:
         if convention.leaves_out:
             valid = convention.valid_success(self._truth.T)
             counted = np.add.reduceat(valid.astype(np.int64), self._bases)
-        self._counted = np.where(counted > 0, counted, np.nan)
+        self._is_scored = np.array([is_scored(recording.truth) for recording in recordings])
+        self._counted = np.where(self._is_scored & (counted > 0), counted, np.nan)
 
     def of(
         self, parts: Iterable[tuple[Histories, Pairs, Floats]], count: int, curves_at: int = 0
@@ -82,13 +85,15 @@ class Scorer:
     ) -> Scored:
         """Score answers, each part with the sequence of each pair, int64 [P]."""
         tally = _Tally(self._lengths, count, curves_at, self._convention.thresholds)
-        for sequence, paired, boxes in parts:
+        for part in parts:
+            sequence, paired, boxes = _kept(*part, self._convention)
             for begin in range(0, len(boxes), _CHUNK):
                 now = slice(begin, begin + _CHUNK)
                 some = paired.some(now)
                 truth = self._truth.take(self._bases[sequence[now]] + some.frame, axis=1).T
                 counts = frame_counts(truth, boxes[now], some.frame, self._convention)
                 tally.add(sequence[now], some, counts)
+        tally.failure[~self._is_scored] = -1
         thresholds = {"auc": self._convention.thresholds, "norm_auc": len(NORM_THRESHOLDS)}
         counted = self._counted[:, None]
         scores = {m: tally.sums[m] / (counted * thresholds.get(m, 1)) for m in METRICS}
@@ -179,6 +184,40 @@ class _Tally:
         begin, sizes, lost = begin[new], sizes[new], lost[new]
         at = ranges(begin, sizes)
         np.minimum.at(self.failure.reshape(-1), at, np.repeat(paired.frame[lost], sizes))
+
+
+def _kept(
+    sequence: Ints, paired: Pairs, boxes: Floats, convention: Convention
+) -> tuple[Ints, Pairs, Floats]:
+    """The same, but for answers in whose place that for the frame before counts.
+
+    Which that is depends on the permitted latency: a pair with such an answer, and there are few,
+    becomes one for each of its sigmas.
+    """
+    if not convention.keeps_answer or (usable := is_box(boxes)).all():
+        return sequence, paired, boxes
+    replaced, sigmas, sources = [], [], []
+    for s in np.unique(sequence[~usable]):
+        begin, end = np.searchsorted(sequence, [s, s + 1])
+        low, high = paired.sigma_from[begin:end], paired.sigma_to[begin:end]
+        for m in range(high.max()):
+            # at one sigma there is a pair for each frame, and they ascend
+            at = begin + np.flatnonzero((low <= m) & (m < high))
+            source = at[convention.kept(boxes[at])]
+            others = np.flatnonzero(~usable[at])
+            replaced.append(at[others])
+            sigmas.append(np.full(len(others), m))
+            sources.append(source[others])
+    good, one_sigma = np.flatnonzero(usable), np.concatenate(sigmas)
+    at, source = np.concatenate([good, *replaced]), np.concatenate([good, *sources])
+    sigma_from = np.concatenate([paired.sigma_from[good], one_sigma])
+    sigma_to = np.concatenate([paired.sigma_to[good], one_sigma + 1])
+    order = np.lexsort(
+        (paired.frame[at], sequence[at])
+    )  # as they were: sequences and frames ascend
+    at, source = at[order], source[order]
+    kept = Pairs(paired.item[at], paired.frame[at], sigma_from[order], sigma_to[order])
+    return sequence[at], kept, boxes[source]
 
 
 def _columns(boxes: Sequence[Floats]) -> Floats:

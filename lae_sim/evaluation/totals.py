@@ -160,7 +160,7 @@ class ModelledTotals:
 
     Attributes:
         known: see :class:`.modelled.ModelledScores`.
-        applies: number of sequences whose replay is not exact.
+        applies: number of scored sequences whose replay is not exact.
         unexplained: see :class:`.modelled.ModelledScores`.
     """
 
@@ -179,7 +179,7 @@ class ModelledTotals:
         modelled, outputs = part.modelled, part.replay.processed
         if self.known is None:
             self.known, self.unexplained = modelled.known, modelled.unexplained
-        self.applies += int(modelled.applies.sum())
+        self.applies += int((modelled.applies & part.replay.scored).sum())
         self._outputs += float(outputs.sum())
         self._lost_outputs += float(modelled.lost_share @ outputs)
         for metric in MODELLED:

@@ -279,13 +279,20 @@ def convention_in_words(convention: Convention) -> str:
     invalid = (
         "frames without leave both metrics"
         if convention.leaves_out
-        else "others are misses of AUC, and hits of DP where the truth's centre is not > 0"
+        else "others are misses of AUC, "
+        + (
+            "and hits of DP where the truth's centre is not > 0"
+            if convention.by_centre
+            else "and hits of DP"
+        )
     )
     parts = [f"AUC is the mean over {convention.thresholds} thresholds of the share of frames with "
              f"IoU > t, so that a perfect tracker has {1 - 1 / convention.thresholds:.3f}",
              f"the truth counts if {valid}; {invalid}"]  # fmt: skip
     if convention.first_frame_is_truth:
         parts.append("the answer for frame 0 is replaced by the truth")
+    if convention.keeps_answer:
+        parts.append("an answer of no size takes the one for the frame before")
     if convention.drops_zeros:
         parts.append("sequences that score 0 everywhere leave the mean")
     return "; ".join(parts) + ". DP: share of frames with a centre error of at most 20 px."

@@ -23,6 +23,7 @@ from lae_sim.evaluation.totals import RECOVERED, ModelledTotals, ScoreTotals, To
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.table import (
     CHANGE,
+    FINE_SCORE,
     PERCENT,
     Column,
     Number,
@@ -256,7 +257,7 @@ SWEPT = {"fps": "fps", "latency_scale": "scale"}
 """What a sweep can vary, by its name in reports, with the heading of its column."""
 
 
-_SCORE, _FRAMES = Number(".4f"), Number(".3f", unit=" fr")
+_FRAMES = Number(".3f", unit=" fr")
 _SIGMA = Column("sigma", "sigma", Number("g"))
 
 Line = ChainMap[str, Any]
@@ -302,17 +303,17 @@ def summary_table(
     columns = [_SIGMA] if len(shown_sigmas) > 1 or shown_sigmas != [0.0] else []
     for title, metric in (("AUC", "auc"), ("DP@20", "dp20")):
         columns += [
-            Column(title, metric, _SCORE),
-            Column("offline", f"offline_{metric}", _SCORE),
+            Column(title, metric, FINE_SCORE),
+            Column("offline", f"offline_{metric}", FINE_SCORE),
             Column("change", partial(_change, metric), CHANGE),
             Column("recov.", f"recovered_{metric}", PERCENT),
         ]
         if any(result["modelled"] for report in reports for result in report["results"]):
-            columns.append(Column("modelled", partial(_modelled_of, metric), _SCORE))
+            columns.append(Column("modelled", partial(_modelled_of, metric), FINE_SCORE))
             if metric == "auc":  # that of DP would make the line too long
                 columns.append(Column("[low, high]", _interval_of))
     if any("mauc" in result for report in reports for result in report["results"]):
-        columns += [Column("mAUC", "mauc", _SCORE), Column("mDP", "mdp", _SCORE)]
+        columns += [Column("mAUC", "mauc", FINE_SCORE), Column("mDP", "mdp", FINE_SCORE)]
     columns += [
         Column("tracker", "tracker_fps", Number(".1f", unit=" fps")),
         Column("skipped", "skip_rate", PERCENT),
@@ -391,14 +392,14 @@ def attribute_table(
     columns = [
         Column("sequences", "sequences"),
         _SIGMA,
-        Column("AUC", "auc", _SCORE),
+        Column("AUC", "auc", FINE_SCORE),
         Column("recovered", "recovered_auc", PERCENT),
-        Column("DP@20", "dp20", _SCORE),
+        Column("DP@20", "dp20", FINE_SCORE),
     ]
     lines = [
         line.new_child({**scores, "label": name})
         for line in _lines([("", report)], shown_sigmas)
-        for name, scores in line["attributes"].items()
+        for name, scores in line.get("attributes", {}).items()
     ]
     return _text(columns, sorted(lines, key=itemgetter("label")), "attribute", swept)
 
@@ -407,15 +408,15 @@ def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequenc
     """One line per sequence and forecaster."""
     columns = [
         _SIGMA,
-        Column("AUC", "auc", _SCORE),
-        Column("offline", "offline_auc", _SCORE),
-        Column("DP@20", "dp20", _SCORE),
-        Column("offline", "offline_dp20", _SCORE),
+        Column("AUC", "auc", FINE_SCORE),
+        Column("offline", "offline_auc", FINE_SCORE),
+        Column("DP@20", "dp20", FINE_SCORE),
+        Column("offline", "offline_dp20", FINE_SCORE),
         Column("frames", "world_frames"),
         Column("processed", "processed"),
         Column("init", "init_ms", Number(".1f", unit=" ms")),
         Column("mismatch", lambda line: line["mismatch_sum"] / line["world_frames"], _FRAMES),
-        Column("modelled AUC", partial(_modelled_of, "auc"), _SCORE),
+        Column("modelled AUC", partial(_modelled_of, "auc"), FINE_SCORE),
         Column("[low, high]", _interval_of),
         Column("approximate", "approximate_outputs"),
         Column("disagree", "disagreement", PERCENT),

@@ -17,7 +17,7 @@ from lae_sim.comparison.statistics import ALL_TRACES, Interval
 from lae_sim.engine.clock import parse_duration, split_init
 from lae_sim.replay.search import ReachRange, parse_search
 from lae_sim.report.figures import Curve, Line, Panel, draw_curves, draw_sweep
-from lae_sim.report.study_view import SETTINGS, View, run_of, setting_of, shared_setting
+from lae_sim.report.study_view import SETTINGS, View, run_of, score_name, setting_of, shared_setting
 from lae_sim.report.style import (
     BLUE,
     GREY,
@@ -33,7 +33,7 @@ from lae_sim.report.style import (
     tracker_styles,
 )
 from lae_sim.report.table import printable
-from lae_sim.study.records import MEAN, SummaryRow
+from lae_sim.study.records import SummaryRow
 from lae_sim.study.summary import Scores
 
 if TYPE_CHECKING:
@@ -191,10 +191,10 @@ def _sweep_panels(
     for x, row in sorted(points, key=lambda point: point[0]):
         lines.setdefault((run_of(row), row.forecaster), []).append((x, row))
     order = dict.fromkeys((run_of(row), row.forecaster) for _, row in points)
-    mean = "m" if points[0][1].sigma == MEAN else ""
+    rows = [row for _, row in points]
     logarithmic = key == "scale" and min(x for x, _ in points) > 0
     styles = _styles(view)
-    for metric, name in (("auc", f"{mean}AUC"), ("dp20", f"{mean}DP")):
+    for metric, name in (("auc", score_name("AUC", rows)), ("dp20", score_name("DP", rows))):
         drawn = [
             Line(
                 _label(view, *which),
@@ -217,8 +217,11 @@ def front(view: View) -> Picture | None:
     if not points:
         return None
     rows = [point.row for point in points]
-    caption = "AUC against the mean time of a call; hollow: hold; lines join what no other tracker"
-    return Picture(f"{caption} beats in both: {shared_setting(rows)}", svg_of(_front(view, points)))
+    caption = (
+        f"{score_name('AUC', rows)} against the mean time of a call; hollow: hold; lines join what "
+        f"no other tracker beats in both: {shared_setting(rows)}"
+    )
+    return Picture(caption, svg_of(_front(view, points)))
 
 
 @dataclass(frozen=True)
@@ -250,7 +253,8 @@ def _front(view: View, points: Sequence[Point]) -> Figure:
             axes.plot(point.ms, point.auc, **{**style, "markersize": 7})
         axes.margins(x=0.2, y=0.1)
         _name_trackers(axes, view, within)
-        axes.set(xlabel="mean time of a call (ms)", ylabel="AUC", title=_short(dataset))
+        name = score_name("AUC", [point.row for point in points])
+        axes.set(xlabel="mean time of a call (ms)", ylabel=name, title=_short(dataset))
     legend_below(figure)
     return figure
 
@@ -312,7 +316,8 @@ def _gains(view: View, rows: Sequence[SummaryRow], runs: Sequence[str]) -> Figur
             _dot(panels[0], y, won.value, won.interval, style)
             if recovered is not None and recovered.share is not None:
                 _dot(panels[1], y, recovered.share, recovered.interval, style, 100)
-    panels[0].set(xlabel="AUC won over hold", ylim=(len(runs) - 0.5, -0.5))
+    name = score_name("AUC", rows)
+    panels[0].set(xlabel=f"{name} won over hold", ylim=(len(runs) - 0.5, -0.5))
     panels[1].set(xlabel="latency loss recovered (%)")
     low, high = panels[1].get_xlim()
     panels[1].set_xlim(max(low, -100), min(high, 150))  # where little was lost, intervals are wide

@@ -7,6 +7,7 @@ those for a terminal fewer columns.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -22,6 +23,7 @@ from lae_sim.report.study_view import (
     SETTINGS,
     View,
     run_of,
+    score_name,
     setting_of,
     several,
     shared_setting,
@@ -43,7 +45,7 @@ from lae_sim.report.table import (
     text_of,
     write_csv,
 )
-from lae_sim.study.records import MEAN, Comparison, Requirement, SummaryRow
+from lae_sim.study.records import Comparison, Requirement, SummaryRow
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
@@ -116,6 +118,7 @@ _RANKING = (
 _PAPER = ("AUC", "modelled", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")
 _TERMINAL = ("n", "AUC", "modelled", "ranked by", "jitter", "offline", "recovered", "vs hold", "p",
              "DP", "ms/call", "init ms", "skipped", "age ms", "front")  # fmt: skip
+_INTERVALS = ("AUC", "mAUC", "modelled", "jitter", "AUC of a - b", "mAUC of a - b")
 
 
 def ranking(
@@ -143,12 +146,24 @@ def ranking(
         left_out.add("ranked by")
     columns = [
         *_names(["tracker", "forecaster", "dataset", *(() if standing_alone else settings)]),
-        *(column for column in _RANKING if (titles is None or column.title in titles)
-          and column.title not in left_out),
+        *(_named(column, shown) for column in _RANKING
+          if (titles is None or column.title in titles) and column.title not in left_out),
     ]  # fmt: skip
-    first = "The best AUC first" if standing_alone else "The best AUC of each setting first"
+    first = f"The best {score_name('AUC', shown)}"
+    first += " first" if standing_alone else " of each setting first"
     table = Table.of(columns, rows, "ranking", f"{first}: {shared_setting(shown)}")
     return replace(table, note="; ".join(view.results.ranked_by()))
+
+
+def _named(column: Column, rows: Sequence[SummaryRow]) -> Column:
+    """A column that calls the scores of some rows by their name; offline there is no sigma."""
+    if str(column.value).startswith("offline"):
+        return column
+
+    def named(text: str) -> str:
+        return re.sub(r"\b(AUC|DP)\b", lambda found: score_name(found[0], rows), text)
+
+    return replace(column, title=named(column.title), meaning=named(column.meaning))
 
 
 def _as_ranked(row: SummaryRow) -> dict[str, Any]:
@@ -173,7 +188,6 @@ def table2(view: View) -> Table:
     rows = view.standing
     by_name = {(view.names[run_of(row)], row.dataset, row.forecaster): row for row in rows}
     trackers = dict.fromkeys(tracker for tracker, _, _ in by_name)
-    mean = "m" if rows[0].sigma == MEAN else ""
 
     def columns(dataset: str, metric: str, title: str) -> list[Column]:
         """A score and its change; records are a tracker and a forecaster."""
@@ -200,7 +214,7 @@ def table2(view: View) -> Table:
     scores = [
         column
         for dataset in dict.fromkeys(row.dataset for row in rows)
-        for metric, title in (("auc", f"{mean}AUC"), ("dp20", f"{mean}DP"))
+        for metric, title in (("auc", score_name("AUC", rows)), ("dp20", score_name("DP", rows)))
         for column in columns(dataset, metric, title)
     ]
     table = Table.of(
@@ -281,7 +295,7 @@ def comparison_table(view: View) -> Table:
     columns = [
         *_names([*_differing(rows, ("dataset", *SETTINGS)), "forecaster", "a", "b"]),
         Column("n", "sequences", _COUNT),
-        Column("AUC of a - b", "difference", SIGNED),
+        Column(f"{score_name('AUC', rows)} of a - b", "difference", SIGNED),
         Column("p", "p", p_label),
         Column("p (Holm)", "p_holm", p_label),
         Column("a better here", "better_here", _RATIO),
@@ -290,7 +304,8 @@ def comparison_table(view: View) -> Table:
     if len({row.ranked_by for row in rows}) > 1:
         columns.append(Column("ranked by", "ranked_by"))
     named = [{**row.flat(), "a": view.names[row.a], "b": view.names[row.b]} for row in rows]
-    whose = ", by the modelled AUC" if {row.ranked_by for row in rows} == {"modelled"} else ""
+    modelled = {row.ranked_by for row in rows} == {"modelled"}
+    whose = f", by the modelled {score_name('AUC', rows)}" if modelled else ""
     caption = f"Trackers against each other{whose}{left_out}"
     table = Table.of(columns, named, "comparisons", caption)
     note = (
@@ -397,7 +412,7 @@ def study_text(results: StudyResults | View) -> str:
         tables.append(required_table(view, mark_ends=True))
     parts = []
     for table in tables:
-        text = text_of(table, intervals=("AUC", "modelled", "jitter", "AUC of a - b"))
+        text = text_of(table, intervals=_INTERVALS)
         text = text.replace("★", "*")  # not every terminal has stars
         parts.append("\n".join([table.caption, text, legend_of(table)]))
     lines = [f"{len(results.plan.cells)} cells, {results.computed} of them computed now"]

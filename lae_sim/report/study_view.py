@@ -174,6 +174,11 @@ class View:
                 }
 
 
+def score_name(metric: str, rows: Sequence[SummaryRow | Comparison]) -> str:
+    """What a score of some rows is called: ``"AUC"``, or ``"mAUC"`` over the grid of sigmas."""
+    return f"m{metric}" if rows and rows[0].sigma == MEAN else metric
+
+
 def shared_setting(rows: Sequence[SummaryRow], but: str = "") -> str:
     """What some rows have in common, in words; one key may be left out."""
     parts = []

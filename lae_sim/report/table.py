@@ -65,6 +65,7 @@ class Number:
 
 
 SCORE, SIGNED, COUNT = Number(), Number("+.3f"), Number(",")
+FINE_SCORE = Number(".4f")
 PERCENT, CHANGE = Number(".1f", 100, "%"), Number("+.1f", 100, "%")
 
 

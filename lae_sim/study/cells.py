@@ -36,7 +36,7 @@ from lae_sim.study.spec import is_random
 from lae_sim.trace.file import Trace, held, read_trace
 from lae_sim.trace.metadata import Metadata
 
-VERSION = 4
+VERSION = 5
 """Of the cells' files; another version is another cell."""
 
 GROUP = 1 << 17

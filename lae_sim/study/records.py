@@ -78,7 +78,7 @@ class Staleness:
         age_ms, age_max_ms: the same in world time, sigma included; mean and largest.
         longest_stale_ms: longest time that one output answered.
         failed: share of sequences and repetitions in which an answer misses the target wholly;
-            only at the first sigma.
+            only at the first sigma, and of those with a truth to score by.
         time_to_failure_ms: median time to the first such answer (Kaplan and Meier); None if less
             than half fail.
     """

@@ -52,10 +52,11 @@ COLUMNS = {
 
 ``elapsed_ms`` is the mean time of the calls but the initialisation, ``init_ms`` the latter's;
 ``longest_hold`` and the mismatches are in frames, ``failure_frame`` is the first whose answer does
-not overlap the truth (``world_frames`` if there is none); scores are in 0..1, NaN where the
-sequence leaves the mean or, offline, where the trace lacks boxes. The modelled ones are those under
-the search model, with the ends of their intervals, and ``lost_share`` is the share of the outputs
-answered while the target is lost: NaN where the replay is exact, or the model off.
+not overlap the truth (``world_frames`` if there is none, -1 without a truth to score by); scores
+are in 0..1, NaN where the sequence leaves the mean or, offline, where the trace lacks boxes. The
+modelled ones are those under the search model, with the ends of their intervals, and ``lost_share``
+is the share of the outputs answered while the target is lost: NaN where the replay is exact, or the
+model off.
 """
 
 

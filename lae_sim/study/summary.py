@@ -157,7 +157,8 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
             np.array([place[name] for name in of_entry]), column("repetition")[::count],
         ))  # fmt: skip
         shape = (cell.setting.count, len(names), count)
-        here = np.logical_or.reduce(~exact[::count][order].reshape(shape[:2]))
+        modelled_here = ~exact & (column("failure_frame") >= 0)  # and scored
+        here = np.logical_or.reduce(modelled_here[::count][order].reshape(shape[:2]))
         applies = here if applies is None else np.logical_or(applies, here)
         for name in wanted:
             values = column(name).reshape(entries, count)[order].reshape(shape)
@@ -355,11 +356,12 @@ def _staleness(scores: Scores, s: int) -> Staleness:
     if s:
         return staleness
     failure = scores.repeated["failure_frame"]
-    failed = failure < frames
-    median = _median_survival(failure.ravel(), failed.ravel())
+    scored = failure >= 0
+    failed = (failure < frames)[scored]
+    median = _median_survival(failure[scored], failed)
     return replace(
         staleness,
-        failed=float(failed.mean()),
+        failed=float(failed.mean()) if len(failed) else None,
         time_to_failure_ms=None if median is None else median * frame_ms,
     )
 

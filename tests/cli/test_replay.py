@@ -19,7 +19,8 @@ from lae_sim.engine.policies import every, fifo, shrinking_tail, vot_realtime
 from lae_sim.evaluation import pairing
 from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.evaluation.events import KINDS
-from lae_sim.evaluation.metrics import success_curve
+from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, success_curve
+from lae_sim.evaluation.modelled import FIGURES
 from lae_sim.forecast import base
 from lae_sim.replay.latency import constant
 from lae_sim.report.figures import sweep_figure
@@ -410,12 +411,49 @@ def test_no_offline_score_unless_every_sequence_has_every_frame(tmp_path):
 def test_frames_without_truth_are_counted_and_said(tmp_path):
     [one, other] = lae_sim.read_trace(SLOW, ["boat-calm", "car-chase"])
     bare = lae_sim.Recording.new("bare", other.truth * np.nan, other.boxes, other.elapsed_ns)
+    one.truth[3] = np.nan
     path = written(tmp_path / "bare.parquet", [bare, one])
-    report = replay_json(path)["traces"][0]
-    assert report["frames_without_truth"] == 300
-    assert "1 sequences have none at all, such as 'bare'" in report["notes"][0]
-    assert "missed by AUC and hit by DP" in report["notes"][0]
+    report = replay_json(path, "--per-sequence")["traces"][0]
+    assert report["frames_without_truth"] == 301
+    assert report["notes"][0] == (
+        "1 of 2 sequences have no ground truth after the first frame and are not scored, such as "
+        "'bare'"
+    )
+    assert report["notes"][1] == (
+        "1 frames have no ground truth; pysot counts them as missed by AUC and hit by DP"
+    )
+    for result in report["results"]:
+        unscored, scored = result["per_sequence"]
+        assert {unscored[m] for m in (*METRICS, "offline_auc", "offline_dp20")} == {None}
+        assert {m: result[m] for m in METRICS} == {m: scored[m] for m in METRICS}
+    assert report["offline"]["auc"] == report["results"][0]["per_sequence"][1]["offline_auc"]
     assert "leaves them out" in replay(path, "--convention", "exclude")
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("options", [[], ["--sigma-grid"], ["--latency", "constant:60ms"]])
+def test_a_video_without_truth_has_no_score(tmp_path, convention, options):
+    """Its trace has the box that the tracker was given, and no other truth."""
+    [one] = lae_sim.read_trace(SLOW, ["boat-calm"])
+    one.truth[1:] = np.nan
+    path = written(tmp_path / "video.parquet", [one])
+    report = replay_json(path, "--convention", convention, *options)["traces"][0]
+    assert report["offline"] is None
+    for result in report["results"]:
+        figures = {name: result[name] for name in (*METRICS, "recovered_auc")}
+        figures |= {name: result[name] for name in ("mauc", "mdp") if name in result}
+        if result["modelled"]:
+            figures |= {name: result["modelled"][name] for name in FIGURES}
+        assert set(figures.values()) == {None}
+    out = replay(path, "--convention", convention, *options)
+    lines = [line.split() for line in out.splitlines() if line.startswith("video")]
+    assert lines
+    assert all(line.count("-") >= 8 and "nan" not in line for line in lines)
+    assert "1 of 1 sequences have no ground truth after the first frame" in " ".join(out.split())
+
+
+def test_attributes_that_there_are_not_make_an_empty_table():
+    assert "AUC" in replay(SLOW, "--sequence", "boat-calm", "--attributes")
 
 
 def test_stalls_of_skipped_frames_are_said(tmp_path):

@@ -36,7 +36,14 @@ from lae_sim.evaluation.evaluate import (
     evaluate_groups,
     evaluate_runs,
 )
-from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, PYSOT, precision_curve, success_curve
+from lae_sim.evaluation.metrics import (
+    CONVENTIONS,
+    METRICS,
+    PYSOT,
+    is_scored,
+    precision_curve,
+    success_curve,
+)
 from lae_sim.evaluation.pairing import pair
 from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
@@ -58,7 +65,10 @@ FORECASTERS = {
 
 @st.composite
 def groups(draw: st.DrawFn) -> tuple[Fraction, list[Recording]]:
-    """Some sequences of one frame rate, with truth near the boxes, and some of it missing."""
+    """Some sequences of one frame rate, with truth near the boxes.
+
+    Of some frames the truth is missing, and of some the box has no size.
+    """
     fps, elapsed, boxes = draw(worlds(20))
     shift = st.integers(-24, 24).map(lambda v: v / 4)
     group = [(elapsed, boxes)]
@@ -71,6 +81,8 @@ def groups(draw: st.DrawFn) -> tuple[Fraction, list[Recording]]:
         truth[:, :2] += draw(shift)
         for i in draw(st.sets(st.integers(0, len(boxes) - 1), max_size=4)):
             truth[i] = draw(st.sampled_from([math.nan, 0.0]))
+        for i in draw(st.sets(st.integers(0, len(boxes) - 1), max_size=4)):
+            boxes[i] = draw(st.sampled_from([[0.0] * 4, [*boxes[i][:2], 9.0, -1.0]]))
         recordings.append(Recording.new(f"s{s}", truth, boxes, elapsed))
     return fps, recordings
 
@@ -108,6 +120,24 @@ def test_scores_agree_with_plain_loops_over_the_oracle(
                     assert score == pytest.approx(value, abs=1e-12, nan_ok=True)
 
 
+def test_otb_takes_the_answer_before_at_each_permitted_latency() -> None:
+    """That of frame 2 has no size. Where it answers, it is as the output before it that did."""
+    truth = np.tile([10.0, 50, 40, 30], (8, 1))
+    boxes = truth + np.array([[0], [4], [0], [8], [0], [2], [1], [3]]) * [1, 0, 0, 0]
+    boxes[2] = boxes[5] = 0
+    run = replay_sequence(Recording.new("a", truth, boxes, np.full(8, 40_000_000)), CLOCK)
+    found = evaluate_runs([run], EVERY, FORECASTERS, SIGMA_GRID, CONVENTIONS["otb"])
+    seen = set()
+    for m, sigma in enumerate(SIGMA_GRID):
+        told = answers(run, EVERY, "hold", Hold, sigma).boxes.tolist()
+        expected = scores(truth.tolist(), told, "otb", float)["auc"]
+        assert found.scores["auc"][0, 0, m] == pytest.approx(expected, abs=1e-12)
+        seen.add(round(expected, 9))
+        without = scores(truth.tolist(), told, "elae", float)["auc"]
+        assert without < expected
+    assert len(seen) > 2
+
+
 @given(groups(), SIGMAS, st.sampled_from(list(CONVENTIONS)))
 @settings(max_examples=20)
 def test_curves_and_failures_agree_with_those_of_single_sequences(
@@ -123,11 +153,13 @@ def test_curves_and_failures_agree_with_those_of_single_sequences(
         for f, (forecaster, factory) in enumerate(FORECASTERS.items()):
             for m, sigma in enumerate(sigmas):
                 boxes = answers(run, EVERY, forecaster, factory, sigma).boxes
+                boxes = boxes[convention.kept(boxes)]
                 if convention.first_frame_is_truth:
                     boxes[0] = truth[0]
                 overlaps = (iou(truth[i : i + 1], boxes[i : i + 1])[0] for i in range(len(run)))
                 apart = [i for i, overlap in enumerate(overlaps) if valid[i] and overlap == 0]
-                assert found.failure[f, s, m] == min(apart, default=len(run))
+                first = min(apart, default=len(run)) if is_scored(truth) else -1
+                assert found.failure[f, s, m] == first
             boxes = answers(run, EVERY, forecaster, factory, sigmas[0]).boxes
             for curves, curve, metric in (
                 (found.curves.success, success_curve, "auc"),

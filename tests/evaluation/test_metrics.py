@@ -68,6 +68,7 @@ GOLDEN = [
         # IoU > t: 7 of the 21 thresholds for 1/3, 20 for 1; of 101 thresholds 34 and 100
         ("pysot", 47 / (21 * 8), 7 / 8, 5 / 8, 256 / (51 * 8)),
         ("elae", 27 / (21 * 8), 7 / 8, 5 / 8, 256 / (51 * 8)),
+        # for precision, too, a truth with x < 0 is none: frames 0, 1 and four hits
         ("otb", 40 / (21 * 8), 7 / 8, 6 / 8, 306 / (51 * 8)),
         ("got10k", 47 / (21 * 7), 5 / 7, 2 / 7, 103 / (51 * 7)),
         ("got10k-101", 234 / (101 * 7), 5 / 7, 2 / 7, 103 / (51 * 7)),
@@ -101,14 +102,71 @@ def test_one_frame(name: str) -> None:
     assert found["auc"] == pytest.approx(100 / 101 if name == "got10k-101" else 20 / 21)
 
 
+ZERO = [0.0] * 4
+
+
 @EVERY
-def test_no_truth_at_all(name: str) -> None:
-    found = offline([NONE] * 5, [[1, 2, 30, 40]] * 5, name)
-    if CONVENTIONS[name].leaves_out:
-        assert all(math.isnan(value) for value in found.values())
-    else:  # misses of success, hits of precision, as the toolkits have it
-        assert math.isnan(found["auc"]) if name == "otb" else found["auc"] == 0
-        assert found["dp20"] == 1
+@pytest.mark.parametrize("truth", [[NONE] * 5, [[1, 2, 30, 40]] + [NONE] * 4,
+                                   [[1, 2, 30, 40]] + [ZERO] * 4, [NONE], [ZERO]])  # fmt: skip
+def test_no_score_without_a_truth(name: str, truth: list[list[float]]) -> None:
+    """The truth of the first frame alone is but the initial box, as of a video."""
+    boxes = [[1, 2, 30, 40]] * len(truth)
+    assert all(math.isnan(value) for value in offline(truth, boxes, name).values())
+    found = evaluated(truth, boxes, name)
+    assert np.isnan(found.curves.success).all()
+    assert np.isnan(found.curves.precision).all()
+    assert found.replay.scored.tolist() == [False]
+    assert found.failure.tolist() == [[[-1]]]
+
+
+@EVERY
+def test_one_truth_after_the_first_frame_is_enough(name: str) -> None:
+    box = [100, 100, 30, 40]
+    found = offline([box, NONE, box], [box] * 3, name)
+    perfect = 100 / 101 if name == "got10k-101" else 20 / 21
+    left_out = CONVENTIONS[name].leaves_out
+    assert found["auc"] == pytest.approx(perfect if left_out else perfect * 2 / 3)
+    assert found["dp20"] == 1
+
+
+@pytest.mark.parametrize(
+    ("truth", "dp20"),
+    [([-3.0, 50, 40, 30], 1.0), ([0.0, 50, 40, 30], 1.0), ([50.0, -3, 40, 30], 1.0),
+     ([50.0, 50, 0, 30], 1.0), (ZERO, 1.0), (NONE, 1.0), ([0.5, 50, 40, 30], 0.75)],
+)  # fmt: skip
+def test_otb_hits_any_truth_that_is_not_all_above_0(truth: list[float], dp20: float) -> None:
+    box, far = [10.0, 50, 40, 30], [300.0, 50, 40, 30]
+    assert offline([box, box, truth, box], [box, box, far, box], "otb")["dp20"] == dp20
+
+
+LOST = [ZERO, [300.0, 50, 0, 30], [300.0, 50, 40, -1]]
+
+
+@pytest.mark.parametrize("lost", LOST)
+def test_otb_takes_the_answer_before_one_of_no_size(lost: list[float]) -> None:
+    box = [10.0, 50, 40, 30]
+    boxes = [box, box, lost, lost, box]
+    assert offline([box] * 5, boxes, "otb")["auc"] == pytest.approx(20 / 21)
+    assert offline([box] * 5, boxes, "otb")["dp20"] == 1
+    assert offline([box] * 5, boxes, "pysot")["auc"] == pytest.approx(60 / 105)
+
+
+def test_otb_takes_the_first_answer_as_it_was() -> None:
+    """The toolkit replaces it by the truth after the answers that are none."""
+    truth, first = [10.0, 50, 40, 30], [500.0, 50, 40, 30]
+    found = offline([truth] * 3, [first, ZERO, truth], "otb")
+    assert found["dp20"] == pytest.approx(2 / 3)
+    assert offline([truth] * 3, [ZERO, ZERO, truth], "otb")["auc"] == pytest.approx(40 / 63)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_otb_takes_the_answer_before_one_that_is_not_finite(value: float) -> None:
+    truth = np.tile([10.0, 50, 40, 30], (4, 1))
+    answers = truth.copy()
+    answers[2, 0] = value
+    assert (success_curve(truth, answers, CONVENTIONS["otb"])[:20] == 1).all()
+    assert (precision_curve(truth, answers, CONVENTIONS["otb"]) == 1).all()
+    assert success_curve(truth, answers, PYSOT)[0] == 0.75
 
 
 @pytest.mark.parametrize(
@@ -126,7 +184,7 @@ def test_a_row_of_zeros_is_a_missing_truth_but_for_got10k(
     name: str, auc: float, dp20: float
 ) -> None:
     box = [90, 90, 20, 20]
-    found = offline([box, [0, 0, 0, 0]], [box, box], name)
+    found = offline([[0, 0, 0, 0], box], [box, box], name)
     assert found["auc"] == pytest.approx(auc)
     assert found["dp20"] == dp20
 
@@ -167,6 +225,8 @@ def tracked(draw: st.DrawFn) -> tuple[list[list[float] | None], list[list[float]
         else draw(BOX)
         for box in truth
     ]
+    for lost in draw(st.lists(st.integers(0, len(truth) - 1), max_size=3)):
+        answers[lost] = draw(st.sampled_from(LOST))
     return truth, answers
 
 
@@ -190,11 +250,17 @@ def test_metrics_agree_with_plain_loops_in_fractions(name: str, case: tuple) -> 
 @settings(max_examples=30)
 def test_normalised_precision_agrees_with_a_plain_loop(name: str, case: tuple) -> None:
     truth, answers = case
+    found = offline(array(truth), answers, name)
     errors: list[float] = []
+    scored = any(true is not None and min(true[2:]) > 0 for true in truth[1:] or truth)
     for i, (true, answer) in enumerate(zip(truth, answers)):
+        if name == "otb" and min(answer[2:]) <= 0:
+            answers[i] = answer = answers[max(i - 1, 0)]
         valid = true is not None
         if name == "exclude":
             valid = valid and true[2] > 0 and true[3] > 0
+        elif name == "otb":
+            valid = valid and min(true) > 0
         if name in ("exclude", "got10k", "got10k-101"):
             if not valid:
                 continue
@@ -208,8 +274,7 @@ def test_normalised_precision_agrees_with_a_plain_loop(name: str, case: tuple) -
         dx = x + (w - 1) / 2 - (true[0] + (true[2] - 1) / 2)
         dy = y + (h - 1) / 2 - (true[1] + (true[3] - 1) / 2)
         errors.append(math.sqrt((dx / true[2]) ** 2 + (dy / true[3]) ** 2))
-    found = offline(array(truth), answers, name)
-    if not errors:
+    if not errors or not scored:
         assert math.isnan(found["norm_dp20"])
         assert math.isnan(found["norm_auc"])
         return
@@ -227,7 +292,7 @@ def test_normalised_precision_agrees_with_a_plain_loop(name: str, case: tuple) -
 def test_the_curves_agree_with_the_scores(name: str, case: tuple) -> None:
     truth, answers = array(case[0]), np.array(case[1])
     convention = CONVENTIONS[name]
-    assume(not convention.leaves_out or convention.valid_success(truth).any())
+    assume((truth[min(1, len(truth) - 1) :, 2:] > 0).all(axis=1).any())
     success = success_curve(truth, answers, convention)
     precision = precision_curve(truth, answers, convention)
     assert success.shape == convention.iou_thresholds.shape
@@ -246,12 +311,8 @@ def test_the_curves_of_a_sequence_without_truth_need_no_warning(name: str) -> No
     truth, answers = np.array([NONE] * 3), np.ones((3, 4))
     success = success_curve(truth, answers, CONVENTIONS[name])
     precision = precision_curve(truth, answers, CONVENTIONS[name])
-    if CONVENTIONS[name].leaves_out:
-        assert np.isnan(success).all()
-        assert np.isnan(precision).all()
-    else:
-        assert not success.any()
-        assert (precision == 1).all()
+    assert np.isnan(success).all()
+    assert np.isnan(precision).all()
 
 
 @given(BOX, BOX)

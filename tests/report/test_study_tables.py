@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import csv
+import re
 from fractions import Fraction
 
 import pytest
 from nasty import nasty_traces
 
 from lae_sim.replay.world import SIGMA_GRID
+from lae_sim.report.study_figures import Point, _front, _gains, front
 from lae_sim.report.study_tables import (
     comparison_table,
     ranking,
     required_table,
+    study_text,
     table2,
     write_tables,
 )
-from lae_sim.report.study_view import View
+from lae_sim.report.study_view import View, run_of, setting_of
 from lae_sim.report.table import Cell, Column, Table, latex_of, tex
 from lae_sim.study.records import MEAN
 from lae_sim.study.run import StudyResults, compute_study, flat_rows
@@ -96,6 +99,56 @@ def test_a_mean_over_sigma_shows_no_interval_of_a_single_one(tmp_path):
     means = [row for row in results.summary if row.sigma == MEAN]
     assert [row.uncertainty for row in rows] == [row.uncertainty for row in means]
     assert all(row.staleness is not None for row in rows)  # that is of the first sigma
+
+
+@pytest.fixture(scope="module")
+def over_grid(tmp_path_factory: pytest.TempPathFactory) -> StudyResults:
+    folder = tmp_path_factory.mktemp("grid")
+    study = Study(tuple(nasty_traces(folder)), sigmas=SIGMA_GRID, require_auc=Fraction(1, 2))
+    return compute_study(study, folder / "results", workers=1)
+
+
+def test_means_over_sigma_have_their_own_names(over_grid, tmp_path):
+    view = View(over_grid)
+    means = {(run_of(row), row.forecaster): row for row in over_grid.summary if row.sigma == MEAN}
+    assert any(row.scores["auc"] != view._first[key].scores["auc"] for key, row in (
+        ((run_of(row), setting_of(row), row.forecaster), row) for row in means.values()
+    ))  # fmt: skip
+    table = ranking(view)
+    assert {"mAUC", "mDP", "offline", "offline DP"} < set(table.header)
+    assert not {"AUC", "DP"} & set(table.header)
+    for row in table.rows:
+        entries = dict(zip(table.header, row))
+        key = next(k for k in means if (view.names[k[0]], k[1]) == (row[0].text, row[1].text))
+        assert entries["mAUC"].value == means[key].scores["auc"]
+        assert entries["mDP"].value == means[key].scores["dp20"]
+    assert table.caption.startswith("The best mAUC of each setting first")
+    assert "mAUC of a - b" in comparison_table(view).header
+    for column in table.columns:  # what is without latency knows no sigma
+        wrong = r"(?<!m)(AUC|DP)\b" if not column.title.startswith("offline") else r"m(AUC|DP)\b"
+        assert not re.search(wrong, f"{column.title} {column.meaning}")
+    required = required_table(view)  # at the first sigma
+    assert "AUC there" in required.header
+    assert required.caption.endswith("for the required AUC at sigma 0")
+    write_tables(over_grid, tmp_path)
+    assert " & mAUC & " in (tmp_path / "ranking.tex").read_text()
+    text = study_text(view)
+    assert "mAUC: with its 95 % interval" in text.replace("\n", " ")
+    assert "mAUC won over hold" in text.replace("\n", " ")
+    heading = next(line for line in text.splitlines() if line.startswith("tracker "))
+    assert {"mAUC", "mDP"} < set(heading.split())
+
+
+def test_pictures_over_sigma_are_called_mauc(over_grid, results):
+    for study, name in ((over_grid, "mAUC"), (results, "AUC")):
+        view = View(study)
+        assert front(view).caption.startswith(f"{name} against")
+        figure = _front(
+            view, [Point(row, row.elapsed_ms, row.score("auc")) for row in view.standing]
+        )
+        assert {axes.get_ylabel() for axes in figure.axes} == {name}
+        figure = _gains(view, view.standing, [run_of(row) for row in view.standing])
+        assert figure.axes[0].get_xlabel() == f"{name} won over hold"
 
 
 def test_files(results, tmp_path):
