@@ -6,7 +6,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lae_sim.errors import LaeError, shown
@@ -49,18 +49,38 @@ def check_distinct(
 ) -> None:
     """Check that no output would replace an input or another output.
 
+    Files are compared by what they are on the disk, whatever names and links lead there. Of an
+    input that is a folder everything in it counts as read.
+
     Raises:
-        LaeError: if two of them are the same file.
+        LaeError: if two of them are the same file, or an output is there already in such a folder.
     """
-    taken = {_real(path) for path in inputs}
+    inputs = list(inputs)
+    taken = {_identity(path) for path in inputs}
+    folders = {_identity(path): path for path in inputs if os.path.isdir(path)}
     for path in outputs:
-        if _real(path) in taken:
+        if _identity(path) in taken:
             raise LaeError(f"{path} would replace a file that is read, or another output")
-        taken.add(_real(path))
+        taken.add(_identity(path))
+        if os.path.isfile(path):
+            for parent in Path(os.path.realpath(path)).parents if folders else ():
+                if folder := folders.get(_identity(parent)):
+                    raise LaeError(
+                        f"{path} would replace a file in {folder}, which is read: name another "
+                        "place, or remove it"
+                    )
 
 
-def _real(path: str | os.PathLike[str]) -> str:
-    return os.path.realpath(str(path).removeprefix("file://"))
+def _identity(path: str | os.PathLike[str]) -> tuple[object, ...]:
+    """What tells a file from others; of one that is not there, its folder and its name in it."""
+    real = os.path.realpath(str(path).removeprefix("file://"))
+    with suppress(OSError, ValueError):
+        status = os.stat(real)
+        return status.st_dev, status.st_ino
+    with suppress(OSError, ValueError):
+        status = os.stat(os.path.dirname(real))
+        return status.st_dev, status.st_ino, os.path.basename(real)
+    return (real,)
 
 
 def _sync(path: Path) -> None:

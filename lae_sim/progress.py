@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import sys
 import warnings
+from contextlib import suppress
 from typing import Any
 
 SOON_S = 0.5
 """What is done sooner shows no bar, unless it is asked for."""
+
+
+def tell(text: str, end: str = "\n") -> None:
+    """Write to the standard error stream; where nobody reads it any more, the work goes on."""
+    if sys.stderr is not None:  # print would take the standard output
+        with suppress(OSError, ValueError):  # ValueError: it is closed
+            print(text, end=end, file=sys.stderr, flush=True)
 
 
 class ProgressBar:

@@ -15,7 +15,7 @@ from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
 from lae_sim.report.study_tables import write_tables
 from lae_sim.report.study_view import View
-from lae_sim.study.run import StudyResults, compute_study
+from lae_sim.study.run import StudyResults, check_inputs, compute_study
 from lae_sim.study.spec import Study, read_study
 
 
@@ -64,31 +64,36 @@ def run_study(
         workers = named("workers", partial(whole, least=1), workers)
         if scheduler is not None:
             raise LaeError("workers: for this machine: a scheduler says where to compute instead")
-    made, base, kept = _asked_for(study, keys)
+    made, base, kept = _asked_for(study, keys, folder)
     with ProgressBar("study", "tasks", progress) as bar:
 
         def advance(what: str, done: int, total: int) -> None:
             bar(done, total, what)
 
-        results = compute_study(made, folder or kept, base, workers, scheduler, advance)
+        results = compute_study(made, kept, base, workers, scheduler, advance)
     write_views(results, report)
     return results
 
 
-def _asked_for(study: object, keys: Mapping[str, Any]) -> tuple[Study, Path | None, str]:
+def _asked_for(
+    study: object, keys: Mapping[str, Any], folder: str | os.PathLike[str] | None
+) -> tuple[Study, Path | None, str | os.PathLike[str]]:
     """The study, the folder that its paths are relative to, and where its results go."""
+    kept = folder or "study-results"
     if study is not None and keys:
         raise LaeError(f"{next(iter(keys))}: give a study, or its keys, not both")
     if isinstance(study, Study):
-        return study, None, "study-results"
+        return study, None, kept
     if study is None or isinstance(study, Mapping):
-        return Study.of(keys if study is None else study), None, "study-results"
+        return Study.of(keys if study is None else study), None, kept
     if not isinstance(study, (str, os.PathLike)) or str(study).endswith(".parquet"):
         raise LaeError(
             f"study: {shown(study)} is no TOML file and no Study; name traces by traces=..."
         )
     path = Path(study)
-    return read_study(path), path.parent, f"{path.stem}-results"
+    kept = folder or f"{path.stem}-results"
+    check_inputs(kept, [path])
+    return read_study(path), path.parent, kept
 
 
 def write_views(results: StudyResults, report: bool = True) -> None:

@@ -84,16 +84,23 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--skip-missing", action="store_true", help="leave out results without ground truth")
     add("--image-size", type=argument(_size), metavar="WxH", help="image size, such as 1280x720")
+    add(
+        "--force",
+        action="store_true",
+        help="replace a trace of another tracker or dataset, or what is no trace",
+    )
     add("--json", action="store_true", help="print the summary as JSON")
     return parser
 
 
 def _convert(arguments: argparse.Namespace) -> None:
     from lae_sim.importers.convert import convert_results
-    from lae_sim.trace.file import write_trace
+    from lae_sim.trace.file import check_replaces, write_trace
 
     truth_files = dict(arguments.truth_file)
-    check_distinct([arguments.out], [arguments.results, *truth_files.values()])
+    # of a folder those files count that are read (below), and no file is replaced but a trace
+    read = (arguments.results, arguments.truth, *truth_files.values())
+    check_distinct([arguments.out], [path for path in read if path.is_file()])
     with closing(ProgressBar("convert", "sequences")) as bar:
         trace, summary = convert_results(
             arguments.results,
@@ -114,6 +121,8 @@ def _convert(arguments: argparse.Namespace) -> None:
             progress=bar,
         )
     check_distinct([arguments.out], summary.files)
+    if not arguments.force:
+        check_replaces(arguments.out, summary.tracker, summary.dataset)
     write_trace(trace, arguments.out)
     if arguments.json:
         print(json.dumps(summary.document(arguments.out), indent=2))
@@ -136,6 +145,12 @@ def _text(summary: ConversionSummary, out: Path) -> str:
     ]
     if "note" in summary.timing:
         lines.append(f"Note: {summary.timing['note']}.")
+    if summary.row_0_from_truth:
+        lines.append(
+            f"Row 0 is not the initial box in {len(summary.row_0_from_truth)} of "
+            f"{summary.sequences} sequences ({listed(summary.row_0_from_truth)}); there the trace "
+            "starts from the truth, as the tracker did."
+        )
     if summary.without_truth:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from lae_sim.cli.options import add_search, exit_status, new_parser
+from lae_sim.cli.options import add_search, check_outputs, exit_status, new_parser
 
 PROGRAM = "lae-sim fidelity"
 
@@ -67,12 +67,10 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     from lae_sim.report.comparison import fidelity_table, fidelity_verdicts, spread_table
 
     if arguments.plot:
-        from lae_sim.files import check_distinct
         from lae_sim.report.style import check_format
 
         check_format(arguments.plot)
-        inputs = [*arguments.traces, *arguments.closed_loop, *arguments.strided]
-        check_distinct([arguments.plot], inputs)
+        check_outputs(arguments, [arguments.plot], arguments.traces)
     rows = compare_closed_loops(
         arguments.traces,
         arguments.closed_loop,

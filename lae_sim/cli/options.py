@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import os
+import select
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import product
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 from lae_sim.engine.clock import parse_fps, parse_rational, whole
 from lae_sim.errors import LaeError
+from lae_sim.progress import tell
 
 if TYPE_CHECKING:
     from lae_sim.replay.world import World
@@ -194,23 +196,78 @@ def new_parser(program: str, description: str, examples: str) -> argparse.Argume
 def exit_status(work: Callable[[], None], program: str) -> int:
     """Do the work of a command; its exit status is 0, 2 for an error, 130 for Ctrl-C.
 
-    An error is one or two lines on the standard error stream, without a traceback.
+    An error is one or two lines on the standard error stream, without a traceback. Work prints when
+    it has written its files: that nobody reads what it prints is no error.
     """
+    _occupy_closed_streams()
     try:
         work()
-        sys.stdout.flush()
-    except LaeError as error:
-        print(f"{program}: error: {error}", file=sys.stderr)
-        return 2
+        if sys.stdout is not None:
+            sys.stdout.flush()
     except KeyboardInterrupt:
-        print(f"{program}: interrupted", file=sys.stderr)
+        tell(f"{program}: interrupted")
         return 130
-    except BrokenPipeError:  # the reader, such as head, has gone: stay silent from here on
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:
-        print(f"{program}: error: {error}", file=sys.stderr)
+    except (LaeError, OSError) as error:
+        if isinstance(error, BrokenPipeError) and _reader_gone(sys.stdout):  # such as head
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        tell(f"{program}: error: {error}")
         return 2
     return 0
+
+
+def _occupy_closed_streams() -> None:
+    """Let no file be opened under the number of a closed stream: what others print would go there.
+
+    ``print`` itself writes nothing where a stream was closed when Python started.
+    """
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+
+
+def _reader_gone(stream: TextIO) -> bool:
+    """Whether a stream is a pipe that nobody reads any more; not some other pipe that broke."""
+    if not hasattr(select, "poll"):  # Windows
+        return True
+    ends = select.poll()
+    ends.register(stream.fileno(), 0)
+    return bool(ends.poll(0))
+
+
+def check_outputs(
+    arguments: argparse.Namespace,
+    outputs: Iterable[str | os.PathLike[str] | None],
+    traces: Iterable[str] = (),
+) -> None:
+    """Refuse, before the work, files that would replace what a command reads, or a trace.
+
+    Args:
+        arguments: of which the options that all commands call alike are looked at.
+        outputs: what the command writes; none of them is a trace.
+        traces: those it reads, as they were found.
+
+    Raises:
+        LaeError: if one is an input, another output or a trace.
+    """
+    from lae_sim.files import check_distinct
+    from lae_sim.learning.registry import files_named
+    from lae_sim.trace.file import trace_at
+
+    def given(*names: str) -> Iterator[str]:
+        for value in (getattr(arguments, name, None) for name in names):
+            yield from [value] if isinstance(value, str) else value or ()
+
+    written = [path for path in outputs if path]
+    read = [*traces, *given("trace", "closed_loop", "strided", "timing", "root")]
+    for name in given("forecaster", "pre_forecaster", "latency", "policy"):
+        read += files_named(name)
+    check_distinct(written, read)
+    for path in written:
+        if trace_at(path) is not None:
+            raise LaeError(f"{path} is a trace: name another file")
 
 
 def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict
@@ -15,7 +14,7 @@ from lae_sim.cli.options import argument, exit_status, new_parser, parse_box
 from lae_sim.engine.clock import parse_budget, parse_duration, parse_fps, parse_stride, whole
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.plugins import key_and_value
-from lae_sim.progress import ProgressBar
+from lae_sim.progress import ProgressBar, tell
 
 if TYPE_CHECKING:
     from lae_sim.profile.passes import PassSummary
@@ -163,6 +162,11 @@ def parser() -> argparse.ArgumentParser:
     add = group.add_argument
     add("--out", metavar="TRACE", help="the trace (default: TRACKER-DATASET.parquet)")
     add("--resume", action="store_true", help="go on with a profile that was interrupted")
+    add(
+        "--force",
+        action="store_true",
+        help="replace a trace of another tracker or dataset, or what is no trace",
+    )
     add("--json", action="store_true", help="print what was written as JSON")
     return made
 
@@ -218,10 +222,15 @@ def _profile(arguments: argparse.Namespace) -> int:
 
         def notice(text: str) -> None:
             bar.close()
-            print(f"{PROGRAM}: {text}", file=sys.stderr)
+            tell(f"{PROGRAM}: {text}")
 
         profile = run_profile(
-            plan, arguments.out, resume=arguments.resume, progress=bar, notice=notice
+            plan,
+            arguments.out,
+            resume=arguments.resume,
+            force=arguments.force,
+            progress=bar,
+            notice=notice,
         )
     if not profile.traces:  # it was complete already
         return 0

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import add_world, exit_status, new_parser, worlds_of
+from lae_sim.cli.options import add_world, check_outputs, exit_status, new_parser, worlds_of
 from lae_sim.errors import LaeError
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.report.film import Scene
@@ -73,31 +73,31 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _render(arguments: argparse.Namespace) -> None:
-    from lae_sim.files import check_distinct
     from lae_sim.forecast.camera import Camera
 
-    inputs = [arguments.trace, *arguments.strided, arguments.timing, arguments.root]
     out = Path(arguments.out)
     kind = out.suffix.lower()
     folder = out.is_dir() or not kind
     if not folder and kind not in (".mp4", ".png", ".jpg", ".jpeg"):
         raise LaeError(f"--out {out}: name a .mp4, .png or .jpg file, or a folder")
-    check_distinct([out], [path for path in inputs if path])
+    check_outputs(arguments, [out])
     metadata, runs = _replayed(arguments)
     if not folder and len(runs) > 1:
         raise LaeError(
             f"{arguments.trace} has {len(runs)} sequences: choose one with --sequence, or give a "
             "folder as --out"
         )
+    films = [out / f"{run.recording.name.replace('/', '-')}.mp4" for run in runs]
+    if folder:
+        check_outputs(arguments, films)
     sequences = {run.recording.name: _images(run, metadata, arguments) for run in runs}
     camera = Camera(sequences, runs[0].schedule.clock.fps)
     forecasters = {name: load_forecaster(name, camera) for name in arguments.forecaster}
-    for run in runs:
+    for run, film in zip(runs, films):
         scene = Scene.of(run, sequences[run.recording.name], metadata, forecasters)
         if folder:
             out.mkdir(parents=True, exist_ok=True)
-            name = run.recording.name.replace("/", "-")
-            scene.film(out / f"{name}.mp4")
+            scene.film(film)
         elif kind == ".mp4":
             scene.film(out)
         else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from fractions import Fraction
@@ -15,13 +14,14 @@ from lae_sim.cli.options import (
     add_search,
     add_world,
     argument,
+    check_outputs,
     exit_status,
     new_parser,
     worlds_of,
 )
 from lae_sim.engine.clock import parse_rational
 from lae_sim.errors import LaeError
-from lae_sim.files import check_distinct, labels
+from lae_sim.files import labels
 from lae_sim.learning.registry import FORECASTERS
 
 if TYPE_CHECKING:
@@ -184,8 +184,7 @@ def _replay(arguments: argparse.Namespace) -> None:
     result = EvaluationResult(scored)
     document = result.document(arguments.attributes, arguments.per_sequence)
     if arguments.json:
-        json.dump(document, sys.stdout, indent=2, allow_nan=False)
-        print()
+        print(json.dumps(document, indent=2, allow_nan=False))
     else:
         trace_labels = [scenario.label for scenario in asked]
         _print_tables(document["traces"], trace_labels, swept, arguments)
@@ -202,9 +201,7 @@ def _check_files(arguments: argparse.Namespace, swept: Sequence[str]) -> None:
     if arguments.strided and len(arguments.traces) > 1:
         raise LaeError("--strided goes with one trace at a time")
     outputs = [*(getattr(arguments, name) for name in _FILES), arguments.plot]
-    timing = [arguments.timing] if arguments.timing else []
-    inputs = [*arguments.traces, *timing, *arguments.strided]
-    check_distinct([path for path in outputs if path], inputs)
+    check_outputs(arguments, outputs, arguments.traces)
 
 
 def _observers(

@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 
-from lae_sim.cli.options import exit_status, new_parser
+from lae_sim.cli.options import check_outputs, exit_status, new_parser
 
 _EXAMPLES = """\
 examples:
@@ -41,7 +41,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _show(arguments: argparse.Namespace) -> None:
     from lae_sim import __version__
     from lae_sim.errors import LaeError
-    from lae_sim.files import check_distinct
     from lae_sim.report.reach import ReachReport, reach_figure
     from lae_sim.report.trace import overview, plot_times
     from lae_sim.trace.describe import describe
@@ -54,7 +53,7 @@ def _show(arguments: argparse.Namespace) -> None:
     if arguments.plot:
         from lae_sim.report.style import check_format
 
-        check_distinct([arguments.plot], paths)
+        check_outputs(arguments, [arguments.plot], paths)
         check_format(arguments.plot)
     traces = [read_trace(path) for path in paths]
     are_gaps = [trace.metadata.kind == "restarts" for trace in traces]
@@ -63,6 +62,12 @@ def _show(arguments: argparse.Namespace) -> None:
     described = [describe(trace, path) for trace, path in zip(traces, paths)]
     reports = [report for report, _ in described]
     reaches = [ReachReport.of(trace) if gaps else None for trace, gaps in zip(traces, are_gaps)]
+    if arguments.plot and all(are_gaps):
+        from lae_sim.report.style import save
+
+        save(reach_figure([reach for reach in reaches if reach is not None]), arguments.plot)
+    elif arguments.plot:
+        plot_times(described, arguments.plot)
     if arguments.json:
         document = {"format": "lae-show", "version": "1.0", "lae_sim": __version__}
         shown = [
@@ -76,9 +81,3 @@ def _show(arguments: argparse.Namespace) -> None:
             for report, reach in zip(reports, reaches)
         ]
         print("\n\n".join(texts))
-    if arguments.plot and all(are_gaps):
-        from lae_sim.report.style import save
-
-        save(reach_figure([reach for reach in reaches if reach is not None]), arguments.plot)
-    elif arguments.plot:
-        plot_times(described, arguments.plot)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import signal
-import sys
 from collections.abc import Sequence
 
 from lae_sim.cli.options import argument, exit_status, new_parser
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError
+from lae_sim.progress import tell
 
 PROGRAM = "lae-sim study"
 
@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     failed: list[bool] = []
     status = exit_status(lambda: failed.append(_study(arguments)), PROGRAM)
     if status == 130:
-        print("what is finished is kept: the same command goes on from there", file=sys.stderr)
+        tell("what is finished is kept: the same command goes on from there")
     return status or int(any(failed))
 
 

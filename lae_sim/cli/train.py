@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from fractions import Fraction
 from functools import partial
 
-from lae_sim.cli.options import add_worlds, argument, exit_status, new_parser
+from lae_sim.cli.options import add_worlds, argument, check_outputs, exit_status, new_parser
 from lae_sim.engine.clock import whole
-from lae_sim.files import check_distinct, check_folders
+from lae_sim.files import check_folders
 
 PROGRAM = "lae-sim train"
 
@@ -69,7 +69,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from lae_sim.trace.locate import find_traces
 
     paths = find_traces(arguments.traces)
-    check_distinct([arguments.out], paths)
+    check_outputs(arguments, [arguments.out], paths)
     check_folders([arguments.out])
     worlds = worlds_of(arguments)
     traces = [read_trace(path, arguments.sequence) for path in paths]

@@ -87,7 +87,8 @@ def parse_duration(text: str) -> int:
     """Read a duration with its unit (``"47ms"``, ``"0.1s"``) as integer nanoseconds.
 
     Raises:
-        LaeError: if the unit is missing, or the duration is not a whole number of nanoseconds.
+        LaeError: if the unit is missing, or the duration is not a whole number of nanoseconds that
+            fits in 64 bits.
     """
     match = _DURATION.match(text) if isinstance(text, str) else None
     if match is None:
@@ -95,7 +96,18 @@ def parse_duration(text: str) -> int:
     duration = Fraction(match[1]) * UNIT_NS[match[2]]
     if duration.denominator != 1:
         raise LaeError(f"{text!r} is not a whole number of nanoseconds")
-    return int(duration)
+    return fitting(int(duration), text)
+
+
+def fitting(ns: int, text: str) -> int:
+    """A time in ns as it is, if a trace can hold it.
+
+    Raises:
+        LaeError: if it does not fit in 64 bits; it quotes ``text``.
+    """
+    if ns > MAX_INT64:
+        raise LaeError(f"{text}: too long a time: 292 years are the most")
+    return ns
 
 
 def parse_budget(text: str) -> int:
@@ -137,6 +149,8 @@ def split_init(text: str, path: bool = False) -> tuple[str, int | None]:
     try:
         return name, parse_duration(value)
     except LaeError as error:
+        if _DURATION.match(value):  # too long, or too fine
+            raise LaeError(f"{text!r}: init={error}") from error
         raise LaeError(
             f"{text!r}: init={value}: write a time of 0 or more with its unit, as init=800ms"
         ) from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from lae_sim._arrays import Ints
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
 from lae_sim.engine.clock import Clock, Number, parse_fps
 from lae_sim.errors import LaeError, shown
+from lae_sim.importers.coordinates import other_reading, row_0_is_off
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.importers.results import (
     NO_TIMES,
@@ -48,6 +49,8 @@ class ConversionSummary:
         timing: where the times come from: ``source``, and a ``note`` if some were changed.
         sequences, frames, processed: how many; a frame is processed where it has a time.
         median_ms: median time of a processed frame, ms.
+        row_0_from_truth: sequences whose row 0 was more than 3 px off the initial box, from which
+            the tracker started; in the trace it is that box.
         without_truth: results that were left out, since they have no ground truth.
         without_results: sequences of the ground truth that have no results.
         files: what was read.
@@ -63,6 +66,7 @@ class ConversionSummary:
     frames: int
     processed: int
     median_ms: float
+    row_0_from_truth: list[str]
     without_truth: list[str]
     without_results: list[str]
     files: list[Path]
@@ -119,7 +123,8 @@ def convert_results(
 
     Raises:
         LaeError: if the results or the ground truth are missing or damaged, or do not fit each
-            other.
+            other: in length, or since boxes look to be other than ``x, y, w, h`` in pixels, or a
+            frame early or late.
 
     Example:
         >>> import pathlib, tempfile
@@ -168,6 +173,8 @@ def convert_results(
             return read_results(kind, source, repetition, time_unit, measured=given is None)
 
         recordings, timing = _every_frame(matched, annotations, read, given, progress)
+    as_published = recordings
+    recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
     metadata = Metadata.new(
         rate,
         **schedule,
@@ -190,11 +197,13 @@ def convert_results(
         frames=len(elapsed),
         processed=int((elapsed >= 0).sum()),
         median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
+        row_0_from_truth=[new.name for new, old in zip(recordings, as_published) if new is not old],
         without_truth=without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
             *annotations.files.values(),
+            *((given.file,) if given and given.file else ()),
         ],
     )
     return Trace(metadata, recordings), summary
@@ -275,7 +284,10 @@ def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | No
             )
         return results.elapsed_ns
     if results.mean_fps is not None:
-        return np.full(count, frame_ns(results.mean_fps), np.int64)
+        try:
+            return np.full(count, frame_ns(results.mean_fps), np.int64)
+        except LaeError as error:
+            raise LaeError(f"{source.path}: {error}") from error
     raise LaeError(f"{source.path}: the results hold no times; {NO_TIMES}")
 
 
@@ -308,6 +320,30 @@ def _real_time(
 def _check(recording: Recording, results: Path, truth: Path) -> None:
     """Check one recording by the rules of the format, so that the message names its files."""
     RowChecker(f"{results} (ground truth {truth})")(Rows.of_recordings([recording]))
+
+
+def _started(recording: Recording, results: Path) -> Recording:
+    """The recording with the initial box in row 0, where results have another there.
+
+    The tracker was given the truth of frame 0, whatever its results say.
+
+    Raises:
+        LaeError: if the boxes look to be something else than a box of each frame in pixels.
+    """
+    truth, boxes = recording.truth, recording.boxes
+    other = other_reading(truth, boxes)
+    if other is not None:
+        evidence = f"mean IoU {other.iou_as_is:.2f} as x, y, w, h in pixels"
+        if other.iou is not None:
+            evidence += f", {other.iou:.2f} so read"
+        raise LaeError(
+            f"sequence {recording.name!r}: {results} looks like {other.looks_like}: {evidence}; "
+            f"{other.remedy}, in all sequences, or leave this one out with --exclude "
+            f"{recording.name}"
+        )
+    if not row_0_is_off(truth, boxes):
+        return recording
+    return replace(recording, boxes=np.concatenate([truth[:1], boxes[1:]]))
 
 
 def _sequence_entries(

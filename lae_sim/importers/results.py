@@ -20,7 +20,7 @@ import numpy as np
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.numbers import read_durations, read_numbers
-from lae_sim.engine.clock import parse_duration, parse_fps, split_init
+from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
 from lae_sim.errors import LaeError
 from lae_sim.importers.matlab import load_matlab
 
@@ -73,12 +73,14 @@ class GivenTimes:
         constant_ns: one time for all, or None.
         per_sequence: frames (if stated) and time in ns of each sequence.
         init_ns: the time of the initialisation, if it is not that of a frame.
+        file: where they were read, if from a file.
     """
 
     source: str
     constant_ns: int | None
     per_sequence: Mapping[str, tuple[int | None, int]]
     init_ns: int | None = None
+    file: Path | None = None
 
     def of(self, sequence: str, frames: int) -> int:
         """The time of every frame of a sequence of ``frames`` frames, ns.
@@ -126,12 +128,17 @@ def given_times(text: str, tracker: str) -> GivenTimes | None:
         source = f"mean fps {value} given{init}, not measured per frame"
         return GivenTimes(source, frame_ns(parse_fps(value)), {}, init_ns)
     source = f"mean fps of each sequence from {Path(value).name}{init}, not measured per frame"
-    return GivenTimes(source, None, dict(_mean_fps_rows(Path(value), tracker)), init_ns)
+    rows = dict(_mean_fps_rows(Path(value), tracker))
+    return GivenTimes(source, None, rows, init_ns, Path(value))
 
 
 def frame_ns(fps: Fraction) -> int:
-    """The time of one frame at a mean rate, ns, rounded half to even."""
-    return round(10**9 / fps)
+    """The time of one frame at a mean rate, ns, rounded half to even.
+
+    Raises:
+        LaeError: if a frame takes too long.
+    """
+    return fitting(round(10**9 / fps), f"a mean of {float(fps):g} fps")
 
 
 def find_results(path: Path, wanted: str = "auto", repetition: int = 1) -> tuple[str, list[Source]]:

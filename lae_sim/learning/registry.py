@@ -73,6 +73,14 @@ def load_forecaster(name: str, camera: Camera | None = None) -> AnyFactory:
     return cast("AnyFactory", found)
 
 
+def files_named(name: str) -> list[str]:
+    """The files that a name of a forecaster, a policy, ... leads to: weights, a user's module."""
+    kind, colon, value = name.split("camera+")[-1].partition(":")
+    if not colon:
+        return []
+    return [value] if kind == "learned" else [f"{kind.replace('.', '/')}.py"]
+
+
 def needs_training(forecaster: AnyFactory | Trainer) -> TypeGuard[Trainer]:
     """Whether it is a :class:`lae_sim.learning.folds.Trainer`, without importing that module."""
     return hasattr(forecaster, "fit")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, fields
@@ -29,7 +28,7 @@ from lae_sim.errors import LaeError, hint, shown
 from lae_sim.files import check_distinct, check_folders, sequence_names
 from lae_sim.forecast.camera import Camera
 from lae_sim.forecast.costs import parse_cost
-from lae_sim.learning.registry import load_forecaster
+from lae_sim.learning.registry import files_named, load_forecaster
 from lae_sim.profile.gaps import BUDGET_NS, Gaps
 from lae_sim.profile.journal import Journal
 from lae_sim.profile.live import LiveRun, run_every_frame, run_real_time
@@ -50,11 +49,11 @@ from lae_sim.profile.passes import (
 from lae_sim.profile.timed import TimedTracker
 from lae_sim.profile.translation import Translated
 from lae_sim.profile.worker import InProcess, Worker
-from lae_sim.progress import ProgressBar
+from lae_sim.progress import ProgressBar, tell
 from lae_sim.replay.latency import time_label
 from lae_sim.replay.strides import phases
 from lae_sim.replay.world import flag, named, parse_policy, several, text
-from lae_sim.trace.file import read_trace
+from lae_sim.trace.file import check_replaces, read_trace
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -214,6 +213,7 @@ def profile_tracker(
     *,
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    force: bool = False,
     progress: bool | None = None,
     **settings: Any,
 ) -> Profile:
@@ -227,6 +227,8 @@ def profile_tracker(
         out: the first trace, ``.parquet``; further passes are written beside it. By default
             ``TRACKER-DATASET.parquet`` in the current folder.
         resume: whether to go on with a profile that was interrupted.
+        force: whether to replace what is there already, be it a trace of another tracker or
+            dataset, or no trace.
         progress: whether to show a progress bar, and what a user should know besides; by default
             on a terminal and in a notebook.
         settings: attributes of :class:`ProfilePlan`, as :meth:`ProfilePlan.of` takes them.
@@ -255,9 +257,9 @@ def profile_tracker(
         def notice(text: str) -> None:
             if bar.shown:
                 bar.close()
-                print(text, file=sys.stderr)
+                tell(text)
 
-        return run_profile(plan, out, resume=resume, progress=bar, notice=notice)
+        return run_profile(plan, out, resume=resume, force=force, progress=bar, notice=notice)
 
 
 def run_profile(
@@ -265,6 +267,7 @@ def run_profile(
     out: str | os.PathLike[str] | None = None,
     *,
     resume: bool = False,
+    force: bool = False,
     progress: Callable[[int, int], object] = lambda done, total: None,
     notice: Callable[[str], object] = lambda text: None,
 ) -> Profile:
@@ -272,7 +275,7 @@ def run_profile(
 
     Args:
         plan: what to measure.
-        out, resume: as of :func:`profile_tracker`.
+        out, resume, force: as of :func:`profile_tracker`.
         progress: ``progress(done, total)`` is called with world frames, before the first and after
             each.
         notice: called with each line that a user should read.
@@ -291,14 +294,15 @@ def run_profile(
             "remove it to profile anew"
         )
         return Profile((), ())
-    if path.exists() and not resume:
-        notice(f"{path} will be replaced")
     failures: dict[str, list[Failure]] = {}
     interrupted = False
     with closing(_start(plan, notice)) as started:
         with suppress(LaeError):  # a tracker may import libraries, or reach the GPU, only now
             warm_up(started, dataset.sequences[0], min(plan.warmup, 1))
         passes = _passes(plan, dataset, started, path, notice)
+        _check_files(plan, passes, force)
+        if path.exists() and not resume:
+            notice(f"{path} will be replaced")
         described = {f"tracker's {key}": value for key, value in started.describe().items()}
         settled = {"lae_sim": __version__, **plan.settings(), **described}
         journal = Journal(unfinished, settled, resume)
@@ -529,10 +533,23 @@ def _passes(
         real_time(f"closed-loop-{_short(timing)}", timing)
         for timing in dict.fromkeys(plan.closed_loops)
     ]
-    times = [split_timing(timing)[0] for timing in (plan.timing, *plan.closed_loops) if timing]
-    traces = [name for name in times if not name.startswith("constant:")]
-    check_distinct([each.path for each in passes], traces)
     return passes
+
+
+def _check_files(plan: ProfilePlan, passes: Sequence[Pass], force: bool) -> None:
+    """Check that no trace replaces what is read, or without force what is of something else."""
+    times = [split_timing(timing)[0] for timing in (plan.timing, *plan.closed_loops) if timing]
+    inputs = [name for name in times if not name.startswith("constant:")]
+    named = (plan.tracker, plan.pre_forecaster, *map(str, plan.options.values()))
+    for name in filter(None, named):  # an option may be the path of weights
+        inputs += [name, *files_named(name)]
+    inputs += [str(plan.root)] * bool(plan.root)
+    # a dataset's folder may hold the traces: nothing but traces is replaced
+    files = [name for name in inputs if not os.path.isdir(name)]
+    check_distinct([each.path for each in passes], files)
+    for each in passes:
+        if not force:
+            check_replaces(each.path, each.metadata.tracker, each.metadata.dataset)
 
 
 def _short(timing: str) -> str:

@@ -23,6 +23,7 @@ import numpy as np
 from lae_sim.datasets.frames import Image
 from lae_sim.errors import LaeError
 from lae_sim.profile.timed import Answer, TrackerError
+from lae_sim.progress import tell
 from lae_sim.trackers.protocol import checked_frame
 from lae_sim.trackers.stopwatch import THREAD_VARIABLES, Stopwatch
 
@@ -224,8 +225,7 @@ class Worker(_Asked):
             os.truncate(log, 0)
             os.lseek(log, 0, os.SEEK_SET)  # the process's own offset too
             self._output = (self._output + text)[-LAST_WORDS:]
-            sys.stderr.write(text.decode(errors="replace"))
-            sys.stderr.flush()
+            tell(text.decode(errors="replace"), end="")
 
     def _kill(self) -> int:
         """End the process and all of its group, if there is one; its exit status."""

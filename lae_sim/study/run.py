@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
 from lae_sim.errors import LaeError
-from lae_sim.files import written_whole
+from lae_sim.files import check_distinct, written_whole
 from lae_sim.forecast.base import AnyFactory
+from lae_sim.learning.registry import files_named
 from lae_sim.study.cells import Task
 from lae_sim.study.deployment import Slowest, requirement, searches
 from lae_sim.study.executors import cores, run_all
@@ -204,9 +205,23 @@ def compute_study(
         LaeError: if the study cannot be planned, nothing could be computed, or a worker died.
     """
     plan = make_plan(study, base)
+    names = (*study.forecasters, *filter(None, study.pre_forecaster), *study.policies, *study.times)
+    files = [file for name in names for file in files_named(name)]
+    check_inputs(folder, [*(source.input.path for source in plan.sources), *files])
     store = Store(folder)
     with store.locked():
         return _run(plan, store, workers, scheduler, progress)
+
+
+def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathLike[str]]) -> None:
+    """Check that what a study writes, or takes away, is nothing that it reads.
+
+    Raises:
+        LaeError: if it is.
+    """
+    written = [Path(folder, f"{name}.csv") for name in ("summary", "comparisons", "required")]
+    written += [Path(folder, "study.json"), Path(folder, "report.html")]
+    check_distinct([*written, *Path(folder, "tables").glob("*")], inputs)
 
 
 def _run(

@@ -225,6 +225,32 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
             raise TraceError(f"{path}: the trace is empty")
 
 
+def trace_at(path: str | os.PathLike[str]) -> Metadata | None:
+    """What a trace says of itself; None if there is no file, or one that is no trace."""
+    try:
+        return read_trace(path).metadata if os.path.isfile(path) else None
+    except LaeError:
+        return None
+
+
+def check_replaces(path: str | os.PathLike[str], tracker: str, dataset: str) -> None:
+    """Check that a trace would replace nothing but one of the same tracker and dataset.
+
+    Raises:
+        LaeError: if another one, or a file that is no trace, is there.
+    """
+    if not os.path.isfile(path) or not os.path.getsize(path):
+        return
+    found = trace_at(path)
+    if found is None:
+        raise LaeError(f"{path} is there already and is no trace; --force replaces it")
+    if (found.tracker, found.dataset) != (tracker, dataset):
+        raise LaeError(
+            f"{path} is there already, a trace of {shown(found.tracker)} on "
+            f"{shown(found.dataset)}; --force replaces it"
+        )
+
+
 @dataclass(frozen=True)
 class _StoredRecordings:
     """The recordings of a file, read anew on each iteration."""

@@ -86,6 +86,7 @@ def test_json(world, convert):
         "frames": 6,
         "processed": 6,
         "median_ms": 20.0000005,
+        "row_0_from_truth": [],
         "without_truth": [],
         "without_results": [],
     }
@@ -114,6 +115,22 @@ def test_the_first_frame_of_each_sequence_takes_what_the_initialisation_does(wor
             first, *others = recording.elapsed_ns.tolist()
             assert first == 800_000_000
             assert set(others) == {frame_ns}
+
+
+def test_times_beyond_64_bits_are_refused(world, convert):
+    (world / "f.csv").write_text("sequence,fps\na,0.000000000001\nb,20\n")
+    for option in ("constant:999999999999s", "constant:47ms,init=999999999999s",
+                   "mean-fps:0.000000000001", f"mean-fps:{world / 'f.csv'}"):  # fmt: skip
+        status, _, error = convert("KCF", "--time", option)
+        assert status == 2
+        assert "too long a time" in error
+    for name in "ab":
+        path = world / "ECO" / f"{name}.mat"
+        path.parent.mkdir(exist_ok=True)
+        scipy.io.savemat(path, {"res": TRUTH, "fps": 1e-300})
+    status, _, error = convert("ECO")
+    assert status == 2
+    assert "a.mat: a mean of 1e-300 fps: too long a time" in error
 
 
 def test_mat_results(world, convert):
@@ -191,6 +208,25 @@ def test_missing_truth(world, convert):
 def test_truth_without_results(world, convert):
     write(world / "D" / "anno" / "z.txt", TRUTH)
     assert "Without results: z." in convert("KCF")[1]
+
+
+def test_a_row_0_in_another_scale_is_said(world, convert):
+    write(world / "KCF" / "a.txt", [TRUTH[0] * 1.9, *TRUTH[1:]])
+    status, out, _ = convert("KCF")
+    assert status == 0
+    assert (
+        "Row 0 is not the initial box in 1 of 2 sequences (a); there the trace starts from" in out
+    )
+    assert read_trace(world / "t.parquet")["a"].boxes.tolist() == TRUTH.tolist()
+
+
+def test_boxes_by_centre_are_refused(world, convert):
+    write(world / "KCF" / "b.txt", TRUTH + [[w / 2, h / 2, 0, 0] for *_, w, h in TRUTH])
+    status, _, err = convert("KCF")
+    assert status
+    assert "sequence 'b'" in err
+    assert "looks like boxes by centre (cx, cy, w, h): mean IoU 0.1" in err
+    assert "--exclude b" in err
 
 
 def test_lengths_are_checked(world, convert):

@@ -115,6 +115,15 @@ def test_a_duration_is_whole_nanoseconds() -> None:
         parse_duration("0.5ns")
 
 
+def test_a_duration_fits_in_64_bits() -> None:
+    assert parse_duration("9223372036.854775807s") == 2**63 - 1
+    for text in ("9223372036.854775808s", "999999999999s"):
+        with pytest.raises(LaeError, match=f"{text}: too long a time"):
+            parse_duration(text)
+        with pytest.raises(LaeError, match=f"init={text}: too long a time"):
+            split_init(f"recorded,init={text}")
+
+
 @pytest.mark.parametrize(
     ("fps", "ticks_per_ns", "frame_ticks"),
     [("30", 30, 10**9), ("30000/1001", 30000, 1001 * 10**9), ("29.97", 2997, 100 * 10**9)],
