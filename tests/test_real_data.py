@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from witness import scores
 
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.caveats import left_search
 from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
+from lae_sim.evaluation.metrics import find_convention, precision_curve, success_curve
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import by_frame, constant, scaled
 from lae_sim.replay.run import replay_sequence
@@ -155,3 +157,20 @@ def test_targets_of_dtb70_leave_the_search_region_during_a_slow_initialisation(
     runs = replay_trace(nanotrack, latency=f"constant:47ms,init={init}")
     found = evaluate_runs(runs, METADATA, {"hold": FORECASTERS["hold"]}).replay
     assert len(left_search(found)) == count
+
+
+def test_otb_on_uavdt_whose_truths_reach_over_the_border(shared_data: Path) -> None:
+    otb = find_convention("otb")
+    found, expected = [], []
+    with np.load(shared_data / "results_boxes" / "UAVDT" / "KCF_GaussHog.npz") as results:
+        for name in results.files:
+            truth = np.loadtxt(shared_data / "UAVDT" / "anno" / f"{name}.txt", delimiter=",")
+            boxes = results[name].astype(float)
+            success, precision = (f(truth, boxes, otb) for f in (success_curve, precision_curve))
+            found.append((success.mean(), precision[20]))
+            if name in ("S0304", "S1601"):  # where it matters, and not too long
+                values = scores(truth.tolist(), boxes.tolist(), "otb", float)
+                expected.append((values["auc"], values["dp20"]))
+                assert found[-1] == pytest.approx(expected[-1], abs=1e-12)
+    assert len(expected) == 2
+    assert np.round(np.mean(found, axis=0), 3).tolist() == [0.29, 0.571]

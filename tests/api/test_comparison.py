@@ -179,6 +179,12 @@ def test_forecasters_are_ranked_by_the_model_where_the_reach_is_known() -> None:
     assert set(result.attributes["metric"]) == set(result.metrics)
 
 
+def test_a_comparison_over_the_grid_calls_its_means_mauc() -> None:
+    result = lae_sim.compare_forecasters(SLOW, forecasters="kalman", sigma="grid")
+    mean = result.summary.set_index(["metric", "forecaster"]).loc[("mauc", "hold"), "mean"]
+    assert f": mAUC hold {mean:.4f}, kalman " in repr(result)
+
+
 def test_an_assumed_range_does_not_rank() -> None:
     plain, beside = (
         lae_sim.compare_forecasters(SLOW, forecasters="kalman", search=search, **FAR)

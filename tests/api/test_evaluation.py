@@ -451,3 +451,15 @@ def test_a_progress_bar_counts_world_frames(capsys: pytest.CaptureFixture[str]) 
     assert "1.20k/1.20k" in err
     lae_sim.evaluate(SLOW, progress=False)
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_video_without_truth_shows_itself_without_a_score(tmp_path: Path) -> None:
+    trace = lae_sim.read_trace(SLOW, ["boat-calm"])
+    [one] = trace
+    one.truth[1:] = np.nan
+    path = tmp_path / "video.parquet"
+    lae_sim.write_trace(lae_sim.Trace(trace.metadata, [one]), path)
+    result = lae_sim.evaluate(path)
+    assert repr(result).endswith(": AUC hold -, kalman ->")
+    assert result.summary[["auc", "dp20", "offline_auc"]].isna().all(axis=None)
+    assert "nan" not in result._repr_html_().lower()
