@@ -36,7 +36,7 @@ import numpy as np
 from lae_sim.comparison.fidelity import REPEATED_WITHIN, FidelityRow, compare_closed_loops
 from lae_sim.datasets.frames import Dataset
 from lae_sim.datasets.layouts import find_dataset
-from lae_sim.engine.clock import parse_duration
+from lae_sim.engine.clock import parse_duration, split_init
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.modelled import MODELLED, UNEXPLAINED, UNEXPLAINED_FORECAST
 from lae_sim.files import text_digest
@@ -110,9 +110,10 @@ def write_times(dataset: Dataset, loop: Loop) -> None:
             mean = parse_duration(path.stem.partition("-")[0].removeprefix("jitter") + "ms")
             elapsed = mean * np.exp(_LOGNORMAL * normal)
         else:
-            call, _, init = loop.setting.removeprefix("constant:").partition(",init=")
-            elapsed = np.full(len(sequence), float(parse_duration(call)))
-            elapsed[0] = parse_duration(init or call)
+            named, init_ns = split_init(loop.setting)
+            call_ns = parse_duration(named.removeprefix("constant:"))
+            elapsed = np.full(len(sequence), float(call_ns))
+            elapsed[0] = call_ns if init_ns is None else init_ns
             elapsed *= 1 + _REPEATED * normal
         boxes = np.ones((len(sequence), 4))  # the times alone are wanted
         times = elapsed.astype(np.int64)

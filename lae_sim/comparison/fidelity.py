@@ -203,9 +203,12 @@ def compare_closed_loops(
         of = _replayed_for(path, closed, replayed)
         schedule = closed.metadata.document["schedule"]
         setting = _setting(closed, settings.setdefault(of.path, []))
-        stands_in = _searched(closed) and not _searched(of.trace)
-        pre_forecaster = schedule["pre_forecaster"] if stands_in else None
-        searches = model(of, pre_forecaster, stands_in and bool(schedule.get("keep_size")))
+        # the model stands in for a pre-forecaster that the replayed trace had not
+        stood_in = (
+            closed.metadata.pre_forecaster if of.trace.metadata.pre_forecaster is None else None
+        )
+        keep_size = stood_in is not None and bool(schedule.get("keep_size"))
+        searches = model(of, stood_in, keep_size)
         rows += _rows(path, closed, of, setting, searches, factories, convention)
     return rows
 
@@ -319,7 +322,9 @@ def _replayed_for(path: str, closed: Trace, replayed: Sequence[_Replayed]) -> _R
             and set(closed.names) <= set(each.trace.names)
         ]
         searched_alike = [e for e in found if not _difference(closed, e.trace, _SEARCH)]
-        found = searched_alike or [each for each in found if not _searched(each.trace)]
+        found = searched_alike or [
+            each for each in found if each.trace.metadata.pre_forecaster is None
+        ]
     if len(found) != 1:
         several = " and ".join(each.path for each in found)
         raise LaeError(
@@ -330,14 +335,9 @@ def _replayed_for(path: str, closed: Trace, replayed: Sequence[_Replayed]) -> _R
     (one,) = found
     # the search model can stand in for a pre-forecaster, but cannot undo one
     _check_same("the closed loop", closed, one, _TRACKER)
-    if _searched(one.trace):
+    if one.trace.metadata.pre_forecaster is not None:
         _check_same("the closed loop", closed, one, _SEARCH)
     return one
-
-
-def _searched(trace: Trace) -> bool:
-    """Whether a pre-forecaster said where the tracker searched."""
-    return trace.metadata.document["schedule"].get("pre_forecaster") is not None
 
 
 def _difference(
@@ -402,8 +402,8 @@ def _setting(closed: Trace, known: list[_Setting]) -> str:
     """The setting of a closed loop: one of those known if it is alike, otherwise a new one."""
     schedule = closed.metadata.document["schedule"]
     rules = [f"{closed.metadata.fps} fps", str(schedule.get("policy", "latest"))]
-    if _searched(closed):
-        rules.append(f"pre-forecaster {schedule['pre_forecaster']}")
+    if closed.metadata.pre_forecaster is not None:
+        rules.append(f"pre-forecaster {closed.metadata.pre_forecaster}")
         rules += ["size kept"] if schedule.get("keep_size") else []
     elapsed = [recording.elapsed_ns[recording.elapsed_ns >= 0] for recording in closed]
     calls = np.concatenate([each[1:] for each in elapsed])

@@ -120,7 +120,7 @@ def notes_on(
             f"no frame after the initialisation ({in_ms(replay.init_ns.mean() / 1e6)}) is "
             f"processed in {len(never)} of {len(sequences)} sequences, such as {never[0]!r}"
         )
-    forecaster = metadata.document["schedule"].get("pre_forecaster")
+    forecaster = metadata.pre_forecaster
     if forecaster is not None and replay.departures.any():
         notes.append(
             f"recorded with the pre-forecaster {forecaster!r}, so the search model says nothing"

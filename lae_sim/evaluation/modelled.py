@@ -121,24 +121,24 @@ def modelled_scores(
     draws = {m: np.zeros((2, forecasters, joint, sigmas)) for m in MODELLED}
     for s, (run, scores) in enumerate(zip(runs, outcomes)):
         modelled = run.modelled
-        for metric in MODELLED:
-            if modelled is None:
+        if modelled is None:
+            for metric in MODELLED:
                 _add(draws[metric], recorded[metric][:, s, None])
-                continue
+            continue
+        lost[s] = modelled.weights[0 if is_known else 1] @ modelled.lost_share
+        for metric in MODELLED:
             values = scores[metric]
+            means = _means(values, modelled.weights)
             if is_known:
+                mean[metric][:, s] = means[:, 0]
                 ends = _quantiles(values, modelled.weights[0])
-                mean[metric][:, s] = _means(values, modelled.weights)[:, 0]
                 low[metric][:, s] = np.maximum(ends[0] - rest[metric], 0.0)
                 high[metric][:, s] = np.minimum(ends[1] + rest[metric], 1.0)
                 _add(draws[metric], values[:, _drawn(run.recording.name, modelled, joint)])
             else:
-                three = _means(values, modelled.weights)
-                mean[metric][:, s] = three[:, 1]
-                low[metric][:, s], high[metric][:, s] = three.min(axis=1), three.max(axis=1)
-                _add(draws[metric], three)
-        if modelled is not None:
-            lost[s] = modelled.weights[0 if is_known else 1] @ modelled.lost_share
+                mean[metric][:, s] = means[:, 1]
+                low[metric][:, s], high[metric][:, s] = means.min(axis=1), means.max(axis=1)
+                _add(draws[metric], means)
     return ModelledScores(is_known, rest, applies, mean, low, high, lost, draws)
 
 

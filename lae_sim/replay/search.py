@@ -395,7 +395,7 @@ def find_search(
             pre-forecaster.
     """
     asked = parse_search(text)
-    searched = metadata.document["schedule"].get("pre_forecaster")
+    searched = metadata.pre_forecaster
     if searched is not None and pre_forecaster is not None:
         raise LaeError(
             f"the trace was recorded with the pre-forecaster {searched!r}: another one goes with a "

@@ -23,6 +23,7 @@ from lae_sim.report.table import (
     Column,
     Number,
     Table,
+    ends_text,
     is_unknown,
     p_label,
     setting_label,
@@ -93,8 +94,7 @@ def comparison_table(summary: pd.DataFrame) -> str:
 
 def _ends(name: str, row: Row) -> str | None:
     """The ends of an interval."""
-    low, high = row[f"{name}_low"], row[f"{name}_high"]
-    return None if is_unknown(low) else f"[{SCORE(low)}, {SCORE(high)}]"
+    return ends_text(row[f"{name}_low"], row[f"{name}_high"])
 
 
 def _against(baseline: str) -> list[Column]:

@@ -27,6 +27,7 @@ from lae_sim.report.table import (
     PERCENT,
     Column,
     Number,
+    ends_text,
     relative_change,
     text_of_records,
 )
@@ -330,9 +331,7 @@ def _modelled_of(metric: str, line: Line) -> float | None:
 def _interval_of(line: Line) -> str | None:
     """The interval of the modelled AUC."""
     modelled = line["modelled"]
-    if not modelled or modelled["auc_low"] is None:
-        return None
-    return f"[{modelled['auc_low']:.3f}, {modelled['auc_high']:.3f}]"
+    return ends_text(modelled["auc_low"], modelled["auc_high"]) if modelled else None
 
 
 def _change(metric: str, line: Line) -> float | None:

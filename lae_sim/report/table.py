@@ -74,6 +74,11 @@ def is_unknown(value: Any) -> bool:
     return value is None or value != value
 
 
+def ends_text(low: float | None, high: float | None) -> str | None:
+    """The ends of a score's interval, such as ``"[0.386, 0.423]"``; None where they are unknown."""
+    return None if is_unknown(low) else f"[{SCORE(low)}, {SCORE(high)}]"
+
+
 def p_label(p: float | None) -> str:
     """A p value as text: ``"0.013"``, ``"<0.001"``, or ``"-"`` if it is not known."""
     return "<0.001" if not is_unknown(p) and p < 0.001 else SCORE(p)  # type: ignore[operator]

@@ -140,6 +140,12 @@ class Metadata:
         return str(dataset.get("name", "unknown") if isinstance(dataset, dict) else dataset)
 
     @property
+    def pre_forecaster(self) -> str | None:
+        """What said where the tracker searched; None where that was its last answer."""
+        name = self.document["schedule"].get("pre_forecaster")
+        return None if name is None else str(name)
+
+    @property
     def stride(self) -> Fraction:
         """Mean frames from one processed frame to the next (see :mod:`lae_sim.replay.strides`)."""
         return parse_rational(self.document["schedule"].get("stride", "1"))
