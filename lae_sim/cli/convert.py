@@ -69,7 +69,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--time-unit", choices=("s", "ms", "us", "ns"), help="unit of measured times (default: s)")
     add("--repetition", type=int, default=1, metavar="K", help="take the K-th run (default: 1)")
-    add("--tracker", metavar="NAME", help="the tracker's name (default: that of RESULTS)")
+    add(
+        "--tracker",
+        metavar="NAME",
+        help="the tracker's name (default: that of RESULTS), or which of several in one folder",
+    )
     add("--device", metavar="TEXT", help="the device that the times were taken on")
     add("--dataset", metavar="NAME", help="the dataset's name (default: that of its folder)")
     add("--sequence", nargs="+", default=[], metavar="NAME", help="only these sequences")
@@ -151,6 +155,8 @@ def _text(summary: ConversionSummary, out: Path) -> str:
             f"{summary.sequences} sequences ({listed(summary.row_0_from_truth)}); there the trace "
             "starts from the truth, as the tracker did."
         )
+    if summary.other_trackers:
+        lines.append(f"Left out, of other trackers: {listed(summary.other_trackers)}.")
     if summary.without_truth:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:

@@ -86,29 +86,6 @@ class GroundTruth:
         """The same with other files for some sequences."""
         return replace(self, files=dict(sorted({**self.files, **files}.items())))
 
-    def match(self, name: str, with_tracker: bool = False) -> str | None:
-        """The sequence that a results file means by ``name``, if there is one.
-
-        Toolkits write ``uav_bike1`` for ``bike1``, ``Jogging.1`` or ``Jogging_1`` for
-        ``Jogging-1``, ``Human4`` for ``Human4-2``, and change capitals.
-
-        Args:
-            name: as the results have it.
-            with_tracker: whether ``_<tracker>`` may follow the sequence's name.
-        """
-        bare = name.removeprefix("uav_")
-        for guess in (name, bare, re.sub(r"[._]([0-9])\Z", r"-\1", name)):
-            if guess in self.files:
-                return guess
-        if f"{name}-2" in self.files and f"{name}-1" not in self.files:
-            return f"{name}-2"
-        alike = [known for known in self.files if known.casefold() == bare.casefold()]
-        if not alike and with_tracker:
-            folded = bare.casefold()
-            alike = [known for known in self.files if folded.startswith(f"{known.casefold()}_")]
-            alike = sorted(alike, key=len)[-1:]
-        return alike[0] if len(alike) == 1 else None
-
 
 def find_truth(root: Path) -> GroundTruth:
     """Find the annotation files of a dataset.

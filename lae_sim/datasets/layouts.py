@@ -20,6 +20,7 @@ import numpy as np
 from lae_sim._arrays import Floats
 from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
+from lae_sim.datasets.names import SequenceNames
 from lae_sim.datasets.synthetic import synthetic_dataset
 from lae_sim.engine.clock import Number, parse_fps
 from lae_sim.errors import LaeError, shown
@@ -113,7 +114,7 @@ def find_dataset(
     attributes = read_attributes(truth)
     chosen_sequences = [
         _sequence(root, sequence, truth.files[sequence], attributes.get(sequence, ()))
-        for sequence in _choose(sequences, truth.files, str(root), truth.match)
+        for sequence in _choose(sequences, truth.files, str(root))
     ]
     return Dataset(name, fps or Fraction(_FPS.get(name, 30)), chosen_sequences)
 
@@ -234,21 +235,17 @@ def _only_first(first: Floats, length: int) -> Floats:
     return truth
 
 
-def _choose(
-    wanted: Sequence[str] | None,
-    available: Iterable[str],
-    where: str,
-    match: Callable[[str], str | None] = lambda name: None,
-) -> list[str]:
+def _choose(wanted: Sequence[str] | None, available: Iterable[str], where: str) -> list[str]:
     """The wanted names of those available, in their order; all of them if none is named."""
     names = list(available)
+    known = SequenceNames(names)
     chosen = set()
     for name in wanted or ():
-        matching = name if name in names else match(name)
-        if matching is None:
+        meant = known.meant(name)
+        if len(meant) != 1:
             close = difflib.get_close_matches(name, names) or names[:3]
             raise LaeError(
                 f"{where}: no sequence {name!r} among {len(names)}; there is {', '.join(close)}"
             )
-        chosen.add(matching)
+        chosen.update(meant)
     return [name for name in names if not wanted or name in chosen]

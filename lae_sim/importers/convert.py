@@ -12,8 +12,9 @@ import numpy as np
 
 from lae_sim._arrays import Ints
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
+from lae_sim.datasets.names import Reading, SequenceNames
 from lae_sim.engine.clock import Clock, Number, parse_fps
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, hint, shown
 from lae_sim.importers.coordinates import other_reading, row_0_is_off
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.importers.results import (
@@ -25,7 +26,6 @@ from lae_sim.importers.results import (
     frame_ns,
     given_times,
     read_results,
-    tracker_name,
 )
 from lae_sim.trace.checks import RowChecker
 from lae_sim.trace.columns import Rows
@@ -51,6 +51,7 @@ class ConversionSummary:
         median_ms: median time of a processed frame, ms.
         row_0_from_truth: sequences whose row 0 was more than 3 px off the initial box, from which
             the tracker started; in the trace it is that box.
+        other_trackers: trackers whose results lie there too, and were left out.
         without_truth: results that were left out, since they have no ground truth.
         without_results: sequences of the ground truth that have no results.
         files: what was read.
@@ -67,6 +68,7 @@ class ConversionSummary:
     processed: int
     median_ms: float
     row_0_from_truth: list[str]
+    other_trackers: list[str]
     without_truth: list[str]
     without_results: list[str]
     files: list[Path]
@@ -108,7 +110,8 @@ def convert_results(
         time: where times come from (see :func:`lae_sim.importers.results.given_times`).
         time_unit: of measured times: ``"s"`` (the default), ``"ms"``, ``"us"`` or ``"ns"``.
         repetition: which run to take where the toolkit repeats them, from 1.
-        tracker: its name; by default that of the results.
+        tracker: its name; by default that of the results. Where results of several trackers lie
+            together, as ``<seq>_<tracker>``, it says which to take.
         device: what the times were taken on.
         dataset: its name; by default that of its folder.
         sequences: names to keep; all by default.
@@ -149,7 +152,8 @@ def convert_results(
     kind, sources = find_results(results, format, repetition)
     other = {name: Path(path) for name, path in (truth_files or {}).items()}
     annotations = find_truth(Path(truth)).with_files(other)
-    known, without_truth = _with_truth(kind, sources, annotations, skip_missing)
+    found = _with_truth(results, sources, annotations, tracker, skip_missing)
+    known = found.sources
     absent = sorted({*sequences, *exclude, *other} - set(known))
     if absent:
         raise LaeError(f"{results}: no results of sequence {listed(absent)}")
@@ -159,7 +163,7 @@ def convert_results(
     dataset = dataset or annotations.dataset
     rate = str(fps or ("10" if "10fps" in dataset.lower() else 30))
     clock = Clock.at(parse_fps(rate))
-    tracker = tracker or tracker_name(kind, results, matched)
+    tracker = tracker or found.tracker or _folder_name(kind, results)
     given = given_times(time, tracker)
     schedule: dict[str, Any] = {"kind": "every-frame"}
     if kind == "lae-pvt":
@@ -198,7 +202,8 @@ def convert_results(
         processed=int((elapsed >= 0).sum()),
         median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
         row_0_from_truth=[new.name for new, old in zip(recordings, as_published) if new is not old],
-        without_truth=without_truth,
+        other_trackers=found.others,
+        without_truth=found.without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
@@ -209,30 +214,87 @@ def convert_results(
     return Trace(metadata, recordings), summary
 
 
+@dataclass(frozen=True)
+class _Matched:
+    """Results and the sequences of the ground truth that they are of.
+
+    Attributes:
+        sources: by sequence.
+        tracker: whose they are, if their names say it.
+        without_truth: names of the tracker's results of no known sequence.
+        others: the other trackers whose results lie there.
+    """
+
+    sources: Mapping[str, Source]
+    tracker: str | None
+    without_truth: list[str]
+    others: list[str]
+
+
 def _with_truth(
-    kind: str, sources: Sequence[Source], truth: GroundTruth, skip_missing: bool
-) -> tuple[dict[str, Source], list[str]]:
-    """The results of each sequence of the ground truth, and the names of those without one."""
-    matched: dict[str, Source] = {}
-    missing = []
+    path: Path, sources: Sequence[Source], truth: GroundTruth, tracker: str | None, skip: bool
+) -> _Matched:
+    """Match results of one tracker, the one that is asked for where there are several."""
+    names = SequenceNames(truth.files)
     only_truth = next(iter(truth.files)) if truth.root.is_file() and len(sources) == 1 else None
+    by_tracker: dict[str | None, list[tuple[str, Source]]] = {}
+    missing = []
     for source in sources:
-        name = truth.match(source.name, with_tracker=kind == "mat") or only_truth
-        if name is None:
+        try:
+            reading = names.read(source.name, tracker)
+        except LaeError as error:
+            raise LaeError(f"{source.path}: {error}") from error
+        if reading is None and only_truth:
+            reading = Reading(only_truth)
+        if reading is None:
             missing.append(source.name)
-        elif name in matched:
+        else:
+            by_tracker.setdefault(reading.tracker, []).append((reading.sequence, source))
+    chosen, others = _one_tracker(path, by_tracker, tracker)
+    if others:
+        missing = [name for name in missing if chosen in (name.split("_", 1)[0], *_tails(name))]
+    matched: dict[str, Source] = {}
+    for name, source in by_tracker.get(chosen, []):
+        if name in matched:
             raise LaeError(
                 f"{source.path} and {matched[name].path} are both results of sequence {name!r}; "
                 "give the folder or file of one tracker"
             )
-        else:
-            matched[name] = source
-    if not matched or (missing and not skip_missing):
+        matched[name] = source
+    if not matched or (missing and not skip):
         raise LaeError(
             f"{truth.root}: no ground truth for {listed(missing)}, of {len(sources)} results"
             + ("; --skip-missing leaves them out" if matched else "; is it the right dataset?")
         )
-    return matched, missing
+    return _Matched(matched, chosen, missing, others)
+
+
+def _tails(name: str) -> list[str]:
+    """What stands behind each underscore."""
+    return [name[at + 1 :] for at, character in enumerate(name) if character == "_"]
+
+
+def _one_tracker(
+    path: Path, by_tracker: Mapping[str | None, list[tuple[str, Source]]], wanted: str | None
+) -> tuple[str | None, list[str]]:
+    """The tracker whose results are taken, and the others that lie there.
+
+    Raises:
+        LaeError: if there are several, and none of them is the one that is wanted.
+    """
+    if len(by_tracker) < 2:
+        return next(iter(by_tracker), None), []
+    known = sorted(tracker for tracker in by_tracker if tracker)
+    if wanted and wanted in by_tracker:
+        return wanted, [tracker for tracker in known if tracker != wanted]
+    found = f"results of {len(known)} trackers ({listed(known, 20)})"
+    if None in by_tracker:
+        plain = [source.path.name for _, source in by_tracker[None]]
+        found += f" and files that name none ({listed(plain, 3)})"
+    raise LaeError(
+        f"{path}: holds {found}; "
+        + (f"none is {wanted!r}{hint(wanted, known)}" if wanted else "choose one with --tracker")
+    )
 
 
 def _every_frame(
@@ -360,6 +422,14 @@ def _sequence_entries(
         }
         entries[name] = {key: value for key, value in entry.items() if value}
     return entries
+
+
+def _folder_name(kind: str, path: Path) -> str:
+    """The tracker's name where only its file of all sequences or its folder has it."""
+    folder = path.resolve()
+    if kind == "npz":
+        return path.stem
+    return folder.parent.name if folder.is_file() else folder.name
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

@@ -225,24 +225,6 @@ def read_mat(path: Path) -> Results:
     return Results(boxes)
 
 
-def tracker_name(kind: str, path: Path, matched: Mapping[str, Source]) -> str:
-    """The tracker's name as its results tell it.
-
-    Args:
-        kind: a name of ``FORMATS``.
-        path: of the results.
-        matched: the source of each sequence.
-    """
-    if kind == "npz":
-        return path.stem
-    if kind == "mat":  # <seq>_<tracker>.mat
-        tails = {source.name[len(name) :].strip("_") for name, source in matched.items()}
-        if len(tails) == 1 and tails != {""}:
-            return tails.pop()
-    folder = path.resolve()
-    return folder.parent.name if folder.is_file() else folder.name
-
-
 def _scalar(value: Any) -> float | None:
     return float(value.item()) if isinstance(value, np.ndarray) and value.size == 1 else None
 

@@ -155,33 +155,6 @@ def test_damaged_attributes(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    ("written", "meant"),
-    [
-        ("Tiger1", "Tiger1"),
-        ("uav_bike1", "bike1"),
-        ("Jogging.1", "Jogging-1"),
-        ("Jogging_2", "Jogging-2"),
-        ("Human4", "Human4-2"),
-        ("Jogging", None),
-        ("tiger1", "Tiger1"),
-        ("nothing", None),
-        ("bike1_KCF", None),
-    ],
-)
-def test_names_of_toolkits(tmp_path, written, meant):
-    names = ["Tiger1", "bike1", "Jogging-1", "Jogging-2", "Human4-2"]
-    truth = find_truth(make(tmp_path, *(f"anno/{name}.txt" for name in names)))
-    assert truth.match(written) == meant
-
-
-def test_names_with_a_tracker(tmp_path):
-    truth = find_truth(make(tmp_path, "person1.txt", "person1_s.txt"))
-    assert truth.match("person1_s_ECO", with_tracker=True) == "person1_s"
-    assert truth.match("person1_ECO", with_tracker=True) == "person1"
-    assert truth.match("person12_ECO", with_tracker=True) is None
-
-
-@pytest.mark.parametrize(
     ("dataset", "sequences", "frames", "attributes"),
     [
         ("DTB70", 70, 15_777, 11),

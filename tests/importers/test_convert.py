@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import scipy.io
 
 from lae_sim.errors import LaeError
 from lae_sim.importers.convert import convert_results
@@ -57,3 +59,52 @@ def test_other_truth_for_a_sequence(folder: Path) -> None:
     np.testing.assert_array_equal(recording.truth, BOXES + 5)
     with pytest.raises(LaeError, match="no results of sequence c"):
         convert_results(folder / "kcf.npz", folder / "D", time="mean-fps:20", exclude=["c"])
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".mat"])
+def test_one_of_several_trackers_in_a_folder(folder: Path, suffix: str) -> None:
+    results = folder / "all"
+    results.mkdir()
+    for name, tracker in (
+        ("a", "KCF"),
+        ("b", "KCF"),
+        ("a", "MY_KCF"),
+        ("zzz", "ECO"),
+        ("b", "ECO"),
+    ):
+        path = results / f"{name}_{tracker}{suffix}"
+        if suffix == ".txt":
+            np.savetxt(path, BOXES + len(tracker), "%g", ",")
+        else:
+            scipy.io.savemat(path, {"res": BOXES + len(tracker)})
+    settings: dict[str, Any] = {"time": "mean-fps:20"}
+    with pytest.raises(LaeError, match=r"results of 3 trackers \(ECO, KCF, MY_KCF\); choose one"):
+        convert_results(results, folder / "D", **settings)
+    with pytest.raises(LaeError, match=r"none is 'KFC'; did you mean 'KCF'"):
+        convert_results(results, folder / "D", tracker="KFC", **settings)
+    trace, summary = convert_results(results, folder / "D", tracker="KCF", **settings)
+    assert [recording.name for recording in trace] == ["a", "b"]
+    np.testing.assert_array_equal(trace["a"].boxes, BOXES + 3)
+    assert (summary.tracker, summary.other_trackers) == ("KCF", ["ECO", "MY_KCF"])
+    # without truth is only what is the tracker's own
+    with pytest.raises(LaeError, match="no ground truth for zzz_ECO, of 5 results; --skip-missing"):
+        convert_results(results, folder / "D", tracker="ECO", **settings)
+    _, summary = convert_results(
+        results, folder / "D", tracker="ECO", skip_missing=True, **settings
+    )
+    assert (summary.sequences, summary.without_truth) == (1, ["zzz_ECO"])
+    np.savetxt(results / "a.txt", BOXES, "%g", ",")
+    if suffix == ".txt":
+        with pytest.raises(LaeError, match=r"3 trackers .* and files that name none \(a\.txt\)"):
+            convert_results(results, folder / "D", **settings)
+
+
+def test_names_say_which_tracker_it_was(folder: Path) -> None:
+    results = folder / "results"
+    results.mkdir()
+    for name in "ab":
+        np.savetxt(results / f"nfs_{name}_C-COT.txt", BOXES, "%g", ",")
+    _, summary = convert_results(results, folder / "D", time="mean-fps:20")
+    assert (summary.tracker, summary.sequences) == ("C-COT", 2)
+    _, summary = convert_results(results, folder / "D", time="mean-fps:20", tracker="mine")
+    assert summary.tracker == "mine"
