@@ -5,6 +5,10 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+import numpy as np
+
+from lae_sim._arrays import Floats
+
 HEAD_BYTES = 1 << 16
 """Of a file, as many are enough for :func:`foreign`."""
 
@@ -75,4 +79,33 @@ def foreign(head: bytes) -> Foreign | None:
         keys = set(re.findall(r'"(\w{1,40})"\s*:', text.decode("utf-8", "replace")))
         kinds = (what for named, what in _KINDS_OF_JSON if keys >= named)
         return Foreign(next(kinds, "JSON"), _BOXES)
+    return None
+
+
+def foreign_columns(table: Floats) -> Foreign | None:
+    """What a table of numbers is that is no boxes ``x, y, w, h`` in pixels, by its columns.
+
+    Args:
+        table: float64 [rows, columns]; NaN = none.
+
+    Returns:
+        None if it may be boxes, or corners of boxes.
+    """
+    rows = table[np.isfinite(table).all(axis=1)]
+    if not len(rows):
+        return None
+    columns = rows.shape[1]
+    whole = np.all(np.rint(rows) == rows, axis=0)
+    within_1 = np.all((rows >= 0) & (rows <= 1), axis=0)
+    if columns == 4 and within_1.all() and ((rows[:, 2:] > 0) & (rows[:, 2:] < 1)).any():
+        return Foreign("boxes in parts of the image", "multiply by its width and height in pixels")
+    if columns in (5, 6) and whole[0] and within_1[1:5].all():
+        what = "YOLO's format (class, centre and size in parts of the image)"
+        return Foreign(what, _BOXES)
+    if columns == 8 and whole[4:].all() and rows[:, 4:].max() < 16 <= rows[:, :4].max():
+        what = "VisDrone's detections (x, y, w, h, score, category, truncation, occlusion)"
+        return Foreign(what, _BOXES)
+    if 7 <= columns <= 10 and columns != 8 and whole[:2].all() and (np.diff(rows[:, 0]) >= 0).all():
+        what = "MOT's format (frame, id, x, y, w, h, ...)"
+        return Foreign(what, "keep x,y,w,h of one target, a line for each frame")
     return None

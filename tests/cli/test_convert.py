@@ -89,6 +89,7 @@ def test_json(world, convert):
         "row_0_from_truth": [],
         "without_truth": [],
         "without_results": [],
+        "notes": [],
     }
 
 
