@@ -54,6 +54,7 @@ class ConversionSummary:
         other_trackers: trackers whose results lie there too, and were left out.
         without_truth: results that were left out, since they have no ground truth.
         without_results: sequences of the ground truth that have no results.
+        notes: what else could not be read, and was left out.
         files: what was read.
     """
 
@@ -71,6 +72,7 @@ class ConversionSummary:
     other_trackers: list[str]
     without_truth: list[str]
     without_results: list[str]
+    notes: list[str]
     files: list[Path]
 
     def document(self, path: str | Path) -> dict[str, Any]:
@@ -106,7 +108,7 @@ def convert_results(
         truth: the dataset's folder (see :mod:`lae_sim.datasets.annotations`).
         format: a name of :data:`lae_sim.importers.results.FORMATS`, or ``"auto"``.
         fps: world frames per second, such as ``30`` or ``"30000/1001"``; by default 30, or 10 if
-            the dataset's name says ``10fps``.
+            the dataset's name says ``10fps``. Of NfS it chooses the set, of 30 or 240.
         time: where times come from (see :func:`lae_sim.importers.results.given_times`).
         time_unit: of measured times: ``"s"`` (the default), ``"ms"``, ``"us"`` or ``"ns"``.
         repetition: which run to take where the toolkit repeats them, from 1.
@@ -151,7 +153,8 @@ def convert_results(
     results = Path(results)
     kind, sources = find_results(results, format, repetition)
     other = {name: Path(path) for name, path in (truth_files or {}).items()}
-    annotations = find_truth(Path(truth)).with_files(other)
+    asked = None if fps is None else parse_fps(fps)
+    annotations = find_truth(Path(truth), asked).with_files(other)
     found = _with_truth(results, sources, annotations, tracker, skip_missing)
     known = found.sources
     absent = sorted({*sequences, *exclude, *other} - set(known))
@@ -161,7 +164,7 @@ def convert_results(
     if not matched:
         raise LaeError("--exclude leaves no sequence")
     dataset = dataset or annotations.dataset
-    rate = str(fps or ("10" if "10fps" in dataset.lower() else 30))
+    rate = str(fps or annotations.fps or ("10" if "10fps" in dataset.lower() else 30))
     clock = Clock.at(parse_fps(rate))
     tracker = tracker or found.tracker or _folder_name(kind, results)
     given = given_times(time, tracker)
@@ -179,6 +182,7 @@ def convert_results(
         recordings, timing = _every_frame(matched, annotations, read, given, progress)
     as_published = recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
+    attributes = read_attributes(annotations)
     metadata = Metadata.new(
         rate,
         **schedule,
@@ -186,7 +190,7 @@ def convert_results(
         device={"model": device} if device else {},
         dataset={"name": dataset},
         timing=timing,
-        sequences=_sequence_entries(matched, read_attributes(annotations), image_size),
+        sequences=_sequence_entries(matched, attributes.of, image_size),
     )
     left_out = {*matched, *exclude}
     elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
@@ -205,6 +209,7 @@ def convert_results(
         other_trackers=found.others,
         without_truth=found.without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
+        notes=list(attributes.notes),
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
             *annotations.files.values(),
@@ -309,7 +314,7 @@ def _every_frame(
     measured = True
     for name, source in matched.items():
         results = read(source)
-        boxes = read_truth(truth.files[name])
+        boxes = read_truth(truth.files[name], len(results.boxes))
         elapsed = _elapsed(name, source, results, given)
         if len(results.boxes) != len(boxes):
             raise LaeError(

@@ -90,6 +90,7 @@ def test_json(world, convert):
         "other_trackers": [],
         "without_truth": [],
         "without_results": [],
+        "notes": [],
     }
 
 
