@@ -67,7 +67,12 @@ def _parser() -> argparse.ArgumentParser:
         "sequence, fps and perhaps tracker, frames; ,init=800ms at the end of one that is not "
         "measured says what the initialisation takes (default: as a frame)",
     )
-    add("--time-unit", choices=("s", "ms", "us", "ns"), help="unit of measured times (default: s)")
+    add(
+        "--time-unit",
+        metavar="UNIT",
+        help="unit of measured times: s, ms, us, ns, fps, or cumulative-s (-ms, ...) for times "
+        "since the start (default: s, where the median is then from 0.5 to 250 ms)",
+    )
     add("--repetition", type=int, default=1, metavar="K", help="take the K-th run (default: 1)")
     add(
         "--tracker",
@@ -147,6 +152,8 @@ def _text(summary: ConversionSummary, out: Path) -> str:
         f"median {_milliseconds(summary.median_ms)} a frame. "
         f"Read as {summary.format}; times: {summary.timing['source']}."
     ]
+    if summary.times_read_as:
+        lines.append(f"Times read as {summary.times_read_as}.")
     if "note" in summary.timing:
         lines.append(f"Note: {summary.timing['note']}.")
     if summary.row_0_from_truth:

@@ -7,15 +7,12 @@ is refused with its file and line, since a shifted row shifts every frame after 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 
-from lae_sim._arrays import Floats, Ints
+from lae_sim._arrays import Floats
 from lae_sim.datasets.foreign import HEAD_BYTES, foreign
-from lae_sim.engine.clock import MAX_INT64, UNIT_NS
 from lae_sim.errors import LaeError
 
 _MAX_BYTES = 1 << 28
@@ -24,9 +21,8 @@ _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 _COMMA = re.compile(r"[0-9],[0-9]")
 _NO_COMMA = re.compile(r"[0-9](?:\s*;\s*|\s+)[-+.0-9]")
 # Lengths are bounded, so that no number needs more than moderate exact arithmetic.
-_NUMBER = re.compile(r"[+-]?(?:[0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})(?:[eE][+-]?[0-9]{1,3})?\Z")
+NUMBER = re.compile(r"[+-]?(?:[0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})(?:[eE][+-]?[0-9]{1,3})?\Z")
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
-_UNITS_OF_ONE_FRAME = ((10**6, "ns"), (10**3, "us"), (1, "ms"))  # least median that looks so
 
 
 def read_lines(path: Path) -> list[str]:
@@ -113,65 +109,12 @@ def read_numbers(
 def _is_header(rows: Sequence[Sequence[str]]) -> bool:
     """Whether the first row names columns of numbers."""
     named = all(re.match(r"[^\W\d]", cell.strip("#\"' ")) for cell in rows[0] if cell != "#")
-    return named and all(_NUMBER.match(cell) for row in rows[1:2] for cell in row)
-
-
-def read_durations(path: Path, unit: str | None = None, column: int = 0) -> Ints:
-    """Durations as exact whole nanoseconds, int64 [rows], rounded half to even.
-
-    Args:
-        path: a text file with a row for each frame.
-        unit: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``. None means seconds, but only if the numbers
-            look like seconds a frame.
-        column: which column to take.
-
-    Raises:
-        LaeError: if a cell is not a duration, the column is not there, or the numbers look like
-            another unit.
-    """
-    rows = read_cells(path)
-    if column >= len(rows[0]):
-        raise LaeError(f"{path}: has {len(rows[0])} columns of times, not {column + 1}")
-    scale = UNIT_NS[unit or "s"]
-    times = []
-    for number, row in enumerate(rows, 1):
-        cell = row[column]
-        if not _NUMBER.match(cell) or cell.startswith("-"):
-            raise LaeError(f"{path}, line {number}: {cell[:40]!r} is not a processing time")
-        times.append(round(Fraction(cell) * scale))
-        if times[-1] > MAX_INT64:
-            raise LaeError(f"{path}, line {number}: {cell[:40]} {unit or 's'} is too long a time")
-    if unit is None:
-        check_seconds(times, str(path))
-    return np.array(times, np.int64)
-
-
-def check_seconds(elapsed_ns: Sequence[int], where: str) -> None:
-    """Check that times which were read as seconds are plausible as such.
-
-    Raises:
-        LaeError: if the median looks like another unit; it says which.
-    """
-    ordered = sorted(time for time in elapsed_ns if time > 0)
-    if not ordered:
-        return
-    median = ordered[len(ordered) // 2] / 1e9
-    for least, unit in _UNITS_OF_ONE_FRAME:
-        if median > least:
-            raise LaeError(
-                f"{where}: the times look like {unit} (median {median:g}): add --time-unit {unit}, "
-                "or --time-unit s if they are seconds"
-            )
-    if median < 1e-5:
-        raise LaeError(
-            f"{where}: the times are too short for seconds (median {median:g}): add --time-unit "
-            "with their unit, or --time-unit s if they are seconds"
-        )
+    return named and all(NUMBER.match(cell) for row in rows[1:2] for cell in row)
 
 
 def _number(cell: str) -> float:
     """The number, or NaN if the cell is none (Python's float would admit ``1_000``)."""
-    return float(cell) if _NUMBER.match(cell) else float("nan")
+    return float(cell) if NUMBER.match(cell) else float("nan")
 
 
 def _text(path: Path) -> str:

@@ -27,6 +27,13 @@ from lae_sim.importers.results import (
     given_times,
     read_results,
 )
+from lae_sim.importers.times import (
+    MeasuredTimes,
+    ascending_note,
+    check_seconds,
+    parse_unit,
+    understood,
+)
 from lae_sim.trace.checks import RowChecker
 from lae_sim.trace.columns import Rows
 from lae_sim.trace.file import Trace
@@ -49,6 +56,7 @@ class ConversionSummary:
         timing: where the times come from: ``source``, and a ``note`` if some were changed.
         sequences, frames, processed: how many; a frame is processed where it has a time.
         median_ms: median time of a processed frame, ms.
+        times_read_as: the unit of measured times, in words; None where none were read.
         row_0_from_truth: sequences whose row 0 was more than 3 px off the initial box, from which
             the tracker started; in the trace it is that box.
         other_trackers: trackers whose results lie there too, and were left out.
@@ -68,6 +76,7 @@ class ConversionSummary:
     frames: int
     processed: int
     median_ms: float
+    times_read_as: str | None
     row_0_from_truth: list[str]
     other_trackers: list[str]
     without_truth: list[str]
@@ -110,7 +119,9 @@ def convert_results(
         fps: world frames per second, such as ``30`` or ``"30000/1001"``; by default 30, or 10 if
             the dataset's name says ``10fps``. Of NfS it chooses the set, of 30 or 240.
         time: where times come from (see :func:`lae_sim.importers.results.given_times`).
-        time_unit: of measured times: ``"s"`` (the default), ``"ms"``, ``"us"`` or ``"ns"``.
+        time_unit: of measured times: ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, or ``"fps"`` for rates;
+            ``"cumulative-s"`` and so on for times since the start. By default seconds, if no header
+            says otherwise and their median is from 0.5 to 250 ms.
         repetition: which run to take where the toolkit repeats them, from 1.
         tracker: its name; by default that of the results. Where results of several trackers lie
             together, as ``<seq>_<tracker>``, it says which to take.
@@ -150,6 +161,7 @@ def convert_results(
             raise LaeError(f"{name}: a path, not {shown(path)}")
     if repetition < 1:
         raise LaeError("--repetition counts from 1")
+    parse_unit(time_unit)
     results = Path(results)
     kind, sources = find_results(results, format, repetition)
     other = {name: Path(path) for name, path in (truth_files or {}).items()}
@@ -170,16 +182,21 @@ def convert_results(
     given = given_times(time, tracker)
     schedule: dict[str, Any] = {"kind": "every-frame"}
     if kind == "lae-pvt":
-        if given:
-            raise LaeError("--time does not go with lae-pvt, whose runs hold their own times")
+        if given or time_unit:
+            raise LaeError("--time does not go with lae-pvt, whose runs hold their own times, in s")
         schedule = {"kind": "real-time", "schedule": {"policy": "latest"}}
         recordings, timing = _real_time(matched, annotations, clock, progress)
+        times_read_as: str | None = "seconds since the start"
     else:
 
         def read(source: Source) -> Results:
             return read_results(kind, source, repetition, time_unit, measured=given is None)
 
-        recordings, timing = _every_frame(matched, annotations, read, given, progress)
+        recordings, timing, times_read_as = _every_frame(
+            matched, annotations, read, given, progress
+        )
+        if time_unit and times_read_as is None:
+            raise LaeError("--time-unit is that of measured times, and none are read here")
     as_published = recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
     attributes = read_attributes(annotations)
@@ -205,6 +222,7 @@ def convert_results(
         frames=len(elapsed),
         processed=int((elapsed >= 0).sum()),
         median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
+        times_read_as=times_read_as,
         row_0_from_truth=[new.name for new, old in zip(recordings, as_published) if new is not old],
         other_trackers=found.others,
         without_truth=found.without_truth,
@@ -308,10 +326,13 @@ def _every_frame(
     read: Callable[[Source], Results],
     given: GivenTimes | None,
     progress: Progress,
-) -> tuple[list[Recording], dict[str, str]]:
-    """The recordings of results on every frame, and what the trace says of their times."""
+) -> tuple[list[Recording], dict[str, str], str | None]:
+    """The recordings of results on every frame, and what the trace says of their times.
+
+    Last comes what measured times were read as (see :func:`lae_sim.importers.times.understood`).
+    """
     recordings = []
-    measured = True
+    times: list[MeasuredTimes] = []
     for name, source in matched.items():
         results = read(source)
         boxes = read_truth(truth.files[name], len(results.boxes))
@@ -322,17 +343,21 @@ def _every_frame(
                 f"{truth.files[name]} has {len(boxes)} rows of ground truth; give that of the "
                 f"same frames with --truth-file {name}=FILE, or leave it out with --exclude {name}"
             )
-        measured = measured and results.elapsed_ns is not None
+        if not given and results.elapsed_ns is not None:
+            path = source.times or source.path
+            times.append(MeasuredTimes(name, path, elapsed, results.unit))
         recordings.append(Recording.new(name, boxes, results.boxes, elapsed))
         _check(recordings[-1], source.path, truth.files[name])
         progress(len(recordings), len(matched))
     if given:
-        return recordings, {"source": given.source}
-    if measured:
-        return recordings, {"source": "measured"}
-    return recordings, {
-        "source": "mean fps of each sequence from the results, not measured per frame"
-    }
+        return recordings, {"source": given.source}, None
+    check_seconds(times)
+    timing = {"source": "mean fps of each sequence from the results, not measured per frame"}
+    if len(times) == len(matched):
+        timing = {"source": "measured"}
+    if note := ascending_note(times):
+        timing["note"] = note
+    return recordings, timing, understood(times) or None
 
 
 def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | None) -> Ints:

@@ -19,10 +19,11 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.numbers import read_durations, read_numbers
+from lae_sim.datasets.numbers import read_numbers
 from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
 from lae_sim.errors import LaeError
 from lae_sim.importers.matlab import load_matlab
+from lae_sim.importers.times import read_times
 
 FORMATS = ("got10k", "pytracking", "ope", "mat", "npz", "lae-pvt")
 
@@ -57,11 +58,13 @@ class Results:
         boxes: ``x, y, w, h`` in pixels, float64 [n, 4].
         elapsed_ns: measured times in ns, int64 [n], if there are any.
         mean_fps: mean frames per second, where the file says only that.
+        unit: of measured times, if it was said (see :func:`lae_sim.importers.times.read_times`).
     """
 
     boxes: Floats
     elapsed_ns: Ints | None = None
     mean_fps: Fraction | None = None
+    unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,7 @@ def read_results(
         kind: a name of ``FORMATS``, but not ``"lae-pvt"``.
         source: its files.
         repetition: which run to take where the files repeat them, from 1.
-        unit: of the measured times (see :func:`lae_sim.datasets.numbers.read_durations`).
+        unit: of the measured times (see :func:`lae_sim.importers.times.read_times`).
         measured: whether measured times are to be read.
 
     Raises:
@@ -197,7 +200,8 @@ def read_results(
     boxes = _checked_boxes(read_numbers(source.path), str(source.path))
     if source.times is None or not measured or kind == "ope":
         return Results(boxes)
-    return Results(boxes, read_durations(source.times, unit, repetition - 1))
+    elapsed_ns, stated = read_times(source.times, unit, repetition - 1)
+    return Results(boxes, elapsed_ns, unit=stated)
 
 
 def read_mat(path: Path) -> Results:

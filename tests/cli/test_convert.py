@@ -86,6 +86,7 @@ def test_json(world, convert):
         "frames": 6,
         "processed": 6,
         "median_ms": 20.0000005,
+        "times_read_as": "seconds per frame, as no unit was given",
         "row_0_from_truth": [],
         "other_trackers": [],
         "without_truth": [],
@@ -248,11 +249,31 @@ def test_lengths_are_checked(world, convert):
 def test_units_are_checked(world, convert):
     write(world / "KCF" / "b_time.txt", ["35.2"] * 6)
     _, _, err = convert("KCF")
-    assert "b_time.txt: the times look like ms (median 35.2): add --time-unit ms" in err
-    status, *_ = convert("KCF", "--time-unit", "ms", "--sequence", "b")
+    assert "b_time.txt: the unit of its times is not known (median 35.2): add --time-unit" in err
+    assert "--time-unit ms (35.2 ms a frame)" in err
+    status, out, _ = convert("KCF", "--time-unit", "ms", "--sequence", "b")
     assert status == 0
+    assert "Times read as milliseconds per frame." in out
     [recording] = read_trace(world / "t.parquet")
     assert set(recording.elapsed_ns.tolist()) == {35_200_000}
+
+
+def test_times_since_the_start(world, convert):
+    write(world / "KCF" / "b_time.txt", np.arange(1, 7) / 2)
+    _, _, err = convert("KCF")
+    assert "b_time.txt: its times ascend from row to row, 0.5 to 3" in err
+    assert convert("KCF", "--time-unit", "cumulative-s", "--sequence", "b")[0] == 0
+    [recording] = read_trace(world / "t.parquet")
+    assert set(recording.elapsed_ns.tolist()) == {500_000_000}
+    _, out, _ = convert("KCF", "--time-unit", "ms", "--sequence", "b")
+    assert "Note: times ascend from row to row in 1 of 1 sequences ('b')" in out
+
+
+def test_a_unit_without_measured_times(world, convert):
+    for options in (["--time", "constant:47ms"], ["--format", "ope", "--time", "mean-fps:9"]):
+        _, _, err = convert("KCF", *options, "--time-unit", "ms")
+        assert "--time-unit is that of measured times" in err
+    assert "no 'minutes': there are s, ms" in convert("KCF", "--time-unit", "minutes")[2]
 
 
 def test_corners_name_the_file(world, convert):
