@@ -7,6 +7,7 @@ is refused with its file and line, since a shifted row shifts every frame after 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
