@@ -18,7 +18,7 @@ from lae_sim.progress import ProgressBar
 if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary
 
-_FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "npz", "lae-pvt")
+_FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "json", "npz", "lae-pvt")
 _EXAMPLES = """\
 formats (auto tells them apart):
   got10k       <seq>.txt with <seq>_time.txt or times/<seq>_time.txt (s);
@@ -26,6 +26,7 @@ formats (auto tells them apart):
   pytracking   <seq>.txt with <seq>_time.txt (s), separated by tabs
   ope          <seq>.txt (comma, tab or space), no times: needs --time
   mat          <seq>.mat or <seq>_<tracker>.mat with res and fps (OTB, UAV123 benchmarks)
+  json         <seq>.json with res and fps (jwlim's tracker_benchmark)
   npz          one file, an array [frames, 4] per sequence: needs --time
   lae-pvt      <seq>.pkl of LAE-PVT and PVT++, recorded in real time
 
@@ -156,6 +157,12 @@ def _text(summary: ConversionSummary, out: Path) -> str:
         lines.append(f"Times read as {summary.times_read_as}.")
     if "note" in summary.timing:
         lines.append(f"Note: {summary.timing['note']}.")
+    if summary.held:
+        lines.append(
+            f"The tracker had no box in {sum(summary.held.values()):,} frames of "
+            f"{len(summary.held)} sequences ({listed(list(summary.held))}); there its last one "
+            "stands."
+        )
     if summary.row_0_from_truth:
         lines.append(
             f"Row 0 is not the initial box in {len(summary.row_0_from_truth)} of "

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.errors import LaeError
 
 HEAD_BYTES = 1 << 16
 """Of a file, as many are enough for :func:`foreign`."""
@@ -54,7 +58,9 @@ _BEGINNINGS = (
     (rb"m-?[0-9]+(?:,-?[0-9]+){4}", "masks of VOT", _MASKS),
     (rb"\{\\rtf", "a rich text document", "save it as plain text"),
 )
+_JSON = "JSON"
 _KINDS_OF_JSON = (
+    ({"image_id", "bbox", "score"}, "COCO's JSON"),
     ({"images", "file_name"}, "COCO's JSON"),
     ({"annotations", "bbox"}, "COCO's JSON"),
     ({"shapes", "points"}, "LabelMe's JSON"),
@@ -78,8 +84,30 @@ def foreign(head: bytes) -> Foreign | None:
     if text[:1] in (b"{", b"["):
         keys = set(re.findall(r'"(\w{1,40})"\s*:', text.decode("utf-8", "replace")))
         kinds = (what for named, what in _KINDS_OF_JSON if keys >= named)
-        return Foreign(next(kinds, "JSON"), _BOXES)
+        return Foreign(next(kinds, _JSON), _BOXES)
     return None
+
+
+@contextmanager
+def told_apart(path: Path, *own: bytes) -> Iterator[None]:
+    """Say what a file looks like that cannot be read as what it should be.
+
+    Args:
+        path: the file.
+        own: how files of its format begin; such a one is damaged, and not another.
+    """
+    try:
+        yield
+    except LaeError as error:
+        try:
+            with path.open("rb") as file:
+                head = file.read(HEAD_BYTES)
+        except OSError:
+            raise error from None
+        other = None if own and head.startswith(own) else foreign(head)
+        if other is None or other.what == _JSON:
+            raise
+        raise LaeError(f"{path}: {other}") from error
 
 
 def foreign_columns(table: Floats) -> Foreign | None:

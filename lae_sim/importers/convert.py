@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lae_sim._arrays import Ints
+from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
 from lae_sim.datasets.names import Reading, SequenceNames
 from lae_sim.engine.clock import Clock, Number, parse_fps
@@ -57,6 +57,7 @@ class ConversionSummary:
         sequences, frames, processed: how many; a frame is processed where it has a time.
         median_ms: median time of a processed frame, ms.
         times_read_as: the unit of measured times, in words; None where none were read.
+        held: frames of each sequence in which the tracker had no box, and its last one stands.
         row_0_from_truth: sequences whose row 0 was more than 3 px off the initial box, from which
             the tracker started; in the trace it is that box.
         other_trackers: trackers whose results lie there too, and were left out.
@@ -77,6 +78,7 @@ class ConversionSummary:
     processed: int
     median_ms: float
     times_read_as: str | None
+    held: Mapping[str, int]
     row_0_from_truth: list[str]
     other_trackers: list[str]
     without_truth: list[str]
@@ -185,19 +187,16 @@ def convert_results(
         if given or time_unit:
             raise LaeError("--time does not go with lae-pvt, whose runs hold their own times, in s")
         schedule = {"kind": "real-time", "schedule": {"policy": "latest"}}
-        recordings, timing = _real_time(matched, annotations, clock, progress)
-        times_read_as: str | None = "seconds since the start"
+        converted = _real_time(matched, annotations, clock, progress)
     else:
 
         def read(source: Source) -> Results:
             return read_results(kind, source, repetition, time_unit, measured=given is None)
 
-        recordings, timing, times_read_as = _every_frame(
-            matched, annotations, read, given, progress
-        )
-        if time_unit and times_read_as is None:
+        converted = _every_frame(matched, annotations, read, given, progress)
+        if time_unit and converted.times_read_as is None:
             raise LaeError("--time-unit is that of measured times, and none are read here")
-    as_published = recordings
+    as_published = converted.recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
     attributes = read_attributes(annotations)
     metadata = Metadata.new(
@@ -206,7 +205,7 @@ def convert_results(
         tracker={"name": tracker},
         device={"model": device} if device else {},
         dataset={"name": dataset},
-        timing=timing,
+        timing=converted.timing,
         sequences=_sequence_entries(matched, attributes.of, image_size),
     )
     left_out = {*matched, *exclude}
@@ -217,12 +216,13 @@ def convert_results(
         fps=rate,
         tracker=tracker,
         dataset=dataset,
-        timing=timing,
+        timing=converted.timing,
         sequences=len(recordings),
         frames=len(elapsed),
         processed=int((elapsed >= 0).sum()),
         median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
-        times_read_as=times_read_as,
+        times_read_as=converted.times_read_as,
+        held=converted.held,
         row_0_from_truth=[new.name for new, old in zip(recordings, as_published) if new is not old],
         other_trackers=found.others,
         without_truth=found.without_truth,
@@ -320,18 +320,33 @@ def _one_tracker(
     )
 
 
+@dataclass(frozen=True)
+class _Converted:
+    """Results as recordings.
+
+    Attributes:
+        recordings: of the matched sequences.
+        timing: what the trace says of their times.
+        times_read_as: what measured times were read as, in words.
+        held: frames of each sequence in which the tracker had no box.
+    """
+
+    recordings: list[Recording]
+    timing: dict[str, str]
+    times_read_as: str | None = None
+    held: Mapping[str, int] = field(default_factory=dict)
+
+
 def _every_frame(
     matched: Mapping[str, Source],
     truth: GroundTruth,
     read: Callable[[Source], Results],
     given: GivenTimes | None,
     progress: Progress,
-) -> tuple[list[Recording], dict[str, str], str | None]:
-    """The recordings of results on every frame, and what the trace says of their times.
-
-    Last comes what measured times were read as (see :func:`lae_sim.importers.times.understood`).
-    """
+) -> _Converted:
+    """The recordings of results on every frame."""
     recordings = []
+    held = {}
     times: list[MeasuredTimes] = []
     for name, source in matched.items():
         results = read(source)
@@ -346,18 +361,51 @@ def _every_frame(
         if not given and results.elapsed_ns is not None:
             path = source.times or source.path
             times.append(MeasuredTimes(name, path, elapsed, results.unit))
-        recordings.append(Recording.new(name, boxes, results.boxes, elapsed))
+        try:
+            answers, count = _held(results.boxes, boxes)
+        except LaeError as error:
+            raise LaeError(f"{source.path}: {error}") from error
+        if count:
+            held[name] = count
+        recordings.append(Recording.new(name, boxes, answers, elapsed))
         _check(recordings[-1], source.path, truth.files[name])
         progress(len(recordings), len(matched))
     if given:
-        return recordings, {"source": given.source}, None
+        return _Converted(recordings, {"source": given.source}, held=held)
     check_seconds(times)
     timing = {"source": "mean fps of each sequence from the results, not measured per frame"}
     if len(times) == len(matched):
         timing = {"source": "measured"}
     if note := ascending_note(times):
         timing["note"] = note
-    return recordings, timing, understood(times) or None
+    return _Converted(recordings, timing, understood(times) or None, held)
+
+
+def _held(boxes: Floats, truth: Floats) -> tuple[Floats, int]:
+    """The boxes with the last one in place of none, as the OTB toolkit has it.
+
+    In row 0 that is the initial box.
+
+    Args:
+        boxes: of the tracker, float64 [n, 4]; NaN = it has none.
+        truth: ground truth, float64 [n, 4].
+
+    Returns:
+        The boxes, and in how many frames after the first there was none.
+
+    Raises:
+        LaeError: if neither has a box in row 0.
+    """
+    lost = np.isnan(boxes[:, 0])
+    if not lost.any():
+        return boxes, 0
+    if lost[0]:
+        if np.isnan(truth[0]).any():
+            raise LaeError("row 1 has no box, and neither has the ground truth")
+        boxes = np.concatenate([truth[:1], boxes[1:]])
+        lost[0] = False
+    last = np.maximum.accumulate(np.where(lost, 0, np.arange(len(boxes))))
+    return boxes[last], int(lost.sum())
 
 
 def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | None) -> Ints:
@@ -385,8 +433,8 @@ def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | No
 
 def _real_time(
     matched: Mapping[str, Source], truth: GroundTruth, clock: Clock, progress: Progress
-) -> tuple[list[Recording], dict[str, str]]:
-    """The recordings of released real-time runs, and what the trace says of their times."""
+) -> _Converted:
+    """The recordings of released real-time runs."""
     runs = []
     for name, source in matched.items():
         runs.append(read_run(source.path, name, read_truth(truth.files[name]), clock))
@@ -406,7 +454,9 @@ def _real_time(
             f"the time of the initialisation is not recorded in {unknown} of {len(runs)} sequences"
         )
     note = {"note": "; ".join(notes)} if notes else {}
-    return [run.recording for run in runs], {"source": "measured", **note}
+    return _Converted(
+        [run.recording for run in runs], {"source": "measured", **note}, "seconds since the start"
+    )
 
 
 def _check(recording: Recording, results: Path, truth: Path) -> None:

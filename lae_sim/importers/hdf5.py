@@ -93,7 +93,8 @@ class _Reader:
         numbers = self._read(item)
         if kind == _CHARACTER:
             return numbers.astype("<u2").tobytes().decode("utf-16-le")
-        return numbers.astype(np.float64, copy=False).T
+        with np.errstate(over="ignore"):
+            return numbers.astype(np.float64, copy=False).T
 
     def _struct(self, group: h5py.Group, depth: int) -> Any:
         """A struct as a dict; several as a list of them."""

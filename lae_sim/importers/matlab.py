@@ -1,7 +1,8 @@
-"""MATLAB files of version 5 to 7: numbers, text, cells and structs.
+"""MATLAB files: numbers, text, cells and structs.
 
-Written out here because ``scipy.io.loadmat`` crashes the process on damaged files. See MathWorks,
-"MAT-File Format": a file is a header and data elements, each with a tag of its type and size.
+Those of version 5 to 7 are read here, since ``scipy.io.loadmat`` crashes the process on damaged
+files. See MathWorks, "MAT-File Format": a file is a header and data elements, each with a tag of
+its type and size.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim.errors import LaeError
+from lae_sim.importers.hdf5 import load_hdf5
 
 _MAX_BYTES = 1 << 27
 _MAX_DEPTH = 16
@@ -49,7 +51,8 @@ def load_matlab(path: Path) -> dict[str, Any]:
     lists in column order, a struct is a dict. Anything else is None.
 
     Raises:
-        LaeError: if the file is of another version, damaged, or larger than any result.
+        LaeError: if the file is of another version, damaged, or larger than any result, or it is
+            of version 7.3 and h5py is not installed.
     """
     try:
         with path.open("rb") as file:
@@ -57,10 +60,10 @@ def load_matlab(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
     if data.startswith(b"MATLAB 7.3") or data.startswith(b"\x89HDF"):
-        raise LaeError(f"{path}: a version 7.3 file; save it in MATLAB with save(..., '-v7')")
+        return load_hdf5(path)
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if not data.startswith(b"MATLAB 5.0") or order is None:
-        raise LaeError(f"{path}: not a MATLAB file of version 5 to 7")
+        raise LaeError(f"{path}: not a MATLAB file of version 5 to 7.3")
     try:
         return _variables(data, order)
     except (ValueError, struct.error, zlib.error, UnicodeError) as error:

@@ -87,6 +87,7 @@ def test_json(world, convert):
         "processed": 6,
         "median_ms": 20.0000005,
         "times_read_as": "seconds per frame, as no unit was given",
+        "held": {},
         "row_0_from_truth": [],
         "other_trackers": [],
         "without_truth": [],
