@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lae_sim.errors import LaeError
-from lae_sim.importers.results import find_results, given_times, read_mat, read_results
+from lae_sim.importers.results import Source, find_results, given_times, read_results
 
 BOXES = np.array([[1, 2, 3, 4], [5, 6, 7.5, 8]])
 TEXT = {"got10k": "1,2,3,4\n5,6,7.5,8\n", "pytracking": "1\t2\t3\t4\n5\t6\t7.5\t8\n"}
@@ -22,6 +22,10 @@ TIMES = "0.1\n0.026255\n"
 def write(path, text):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
+
+
+def read_mat(path):
+    return read_results("mat", Source("a", path), 1, None, measured=True)
 
 
 def read(root, **settings):
@@ -154,7 +158,10 @@ def test_mat_without_a_rate(tmp_path, fps):
         ({"res": "text"}, "table of numbers"),
         ({"res": np.array([[1, 2, 3, np.nan]])}, "row 1 is not finite"),
         ({"results": {"res": BOXES, "len": 3}}, "field 'len' is 3, and 'res' has 2 rows"),
-        ({"results": {"res": BOXES, "type": "ivtAff"}}, "type 'ivtAff'"),
+        ({"results": {"res": BOXES, "type": "polar"}}, "type 'polar'; known are rect, ivtaff"),
+        ({"results": {"res": BOXES, "type": 4}}, r"boxes of type array\("),
+        ({"rects": BOXES, "fps": 3}, "no field 'res' .*; there is rects, fps"),
+        ({"res": BOXES * np.nan}, "no box at all"),
         ({"results": np.array([{"res": BOXES}] * 3, dtype=object)}, "holds 3 runs"),
         ({"results": np.empty((0, 0))}, "no field 'res'"),
     ],
@@ -164,14 +171,6 @@ def test_mat_faults(tmp_path, content, problem):
     scipy.io.savemat(path, content)
     with pytest.raises(LaeError, match=problem):
         read_mat(path)
-
-
-def test_mat_7_3_says_what_to_do(tmp_path):
-    path = tmp_path / "a.mat"
-    for head in (b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512), b"\x89HDF\r\n\x1a\n"):
-        path.write_bytes(head)
-        with pytest.raises(LaeError, match=r"save\(\.\.\., '-v7'\)"):
-            read_mat(path)
 
 
 def test_damaged_mat(tmp_path):
