@@ -137,3 +137,38 @@ def test_what_optional_files_are_left_out_is_said(folder: Path) -> None:
         f"attributes are left out: {folder / 'attributes.csv'}, line 2: needs a name and 1 flags "
         "0 or 1"
     ]
+
+
+def test_the_last_box_stands_where_the_tracker_has_none(folder: Path) -> None:
+    boxes = BOXES + 1
+    boxes[[0, 2, 3]] = np.nan
+    np.savez(folder / "TLD.npz", a=boxes, b=BOXES, c=np.where(np.eye(6, 1) == 1, np.nan, BOXES))
+    trace, summary = convert_results(folder / "TLD.npz", folder / "D", time="mean-fps:20")
+    held = [BOXES[0], *(BOXES[[1, 1, 1, 4, 5]] + 1)]  # the first is the box that it was given
+    np.testing.assert_array_equal(trace["a"].boxes, held)
+    assert summary.held == {"a": 2}
+    assert summary.row_0_from_truth == []
+    np.savez(folder / "TLD.npz", a=boxes * np.nan)
+    with pytest.raises(LaeError, match="'a': holds no box at all"):
+        convert_results(folder / "TLD.npz", folder / "D", time="mean-fps:20")
+    truth = BOXES.copy()
+    truth[0] = np.nan
+    np.savetxt(folder / "D" / "a.txt", truth, "%g", ",")
+    np.savez(folder / "TLD.npz", a=boxes)
+    with pytest.raises(LaeError, match=r"TLD\.npz: row 1 has no box, and neither has the ground"):
+        convert_results(folder / "TLD.npz", folder / "D", time="mean-fps:20")
+
+
+def test_two_sequences_that_a_name_may_mean_are_a_question(folder: Path) -> None:
+    for number in "12":
+        np.savetxt(folder / "D" / f"Jogging-{number}.txt", BOXES, "%g", ",")
+    np.savez(folder / "kcf.npz", Jogging=BOXES)
+    with pytest.raises(LaeError, match=r"kcf\.npz: is it of sequence Jogging-1 or Jogging-2\? .*"):
+        convert_results(folder / "kcf.npz", folder / "D", time="mean-fps:20")
+    trace, _ = convert_results(
+        folder / "kcf.npz",
+        folder / "D",
+        time="mean-fps:20",
+        truth_files={"Jogging": folder / "D" / "Jogging-2.txt"},
+    )
+    assert [recording.name for recording in trace] == ["Jogging"]
