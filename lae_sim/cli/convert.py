@@ -25,10 +25,12 @@ formats (auto tells them apart):
                <seq>/<seq>_001.txt with <seq>/<seq>_time.txt
   pytracking   <seq>.txt with <seq>_time.txt (s), separated by tabs
   ope          <seq>.txt (comma, tab or space), no times: needs --time
-  mat          <seq>.mat or <seq>_<tracker>.mat with res and fps (OTB, UAV123 benchmarks)
+  mat          <seq>.mat with res and fps, boxes or another motion model (OTB, UAV123 benchmarks)
   json         <seq>.json with res and fps (jwlim's tracker_benchmark)
   npz          one file, an array [frames, 4] per sequence: needs --time
   lae-pvt      <seq>.pkl of LAE-PVT and PVT++, recorded in real time
+Names may be <dataset>_<seq> (nfs_, uav_, ...), <seq>_<tracker> and <tracker>_<seq> in any format;
+of several trackers in a folder --tracker chooses one. A .mat of version 7.3 needs lae-sim[mat73].
 
 examples:
   lae-sim convert results/kcf --truth OTB100 --out kcf.parquet
@@ -36,6 +38,7 @@ examples:
   lae-sim convert results/ECO --truth UAV123_10fps --fps 10 --time mean-fps:13.5 --out eco.parquet
   lae-sim convert results_rt_raw/siamrpn --truth UAVDT --device 'AGX Xavier' --out rt.parquet
   lae-sim convert results/kcf --truth OTB100 --truth-file Tiger1=Tiger1_354.txt --out kcf.parquet
+  lae-sim convert results/OPE_OTB --tracker ECO-HC --truth OTB100 --out eco-hc.parquet
 """
 
 

@@ -43,6 +43,8 @@ from lae_sim.trace.recording import Recording
 Progress = Callable[[int, int], object]
 """``progress(done, total)`` is called after each sequence."""
 
+_VOT_EXPERIMENTS = ("baseline", "longterm", "realtime", "supervised", "unsupervised")
+
 
 @dataclass(frozen=True)
 class ConversionSummary:
@@ -506,10 +508,10 @@ def _sequence_entries(
 
 def _folder_name(kind: str, path: Path) -> str:
     """The tracker's name where only its file of all sequences or its folder has it."""
-    folder = path.resolve()
     if kind == "npz":
         return path.stem
-    return folder.parent.name if folder.is_file() else folder.name
+    folder = path.resolve().parent if path.is_file() else path.resolve()
+    return folder.parent.name if folder.name in _VOT_EXPERIMENTS else folder.name
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

@@ -172,3 +172,12 @@ def test_two_sequences_that_a_name_may_mean_are_a_question(folder: Path) -> None
         truth_files={"Jogging": folder / "D" / "Jogging-2.txt"},
     )
     assert [recording.name for recording in trace] == ["Jogging"]
+
+
+def test_a_vot_experiment_is_in_its_trackers_folder(folder: Path) -> None:
+    path = folder / "results" / "TRK" / "unsupervised" / "a" / "a_001.txt"
+    path.parent.mkdir(parents=True)
+    path.write_text("\n".join(["1", *(",".join(map(str, box)) for box in BOXES[1:])]))
+    trace, summary = convert_results(path.parents[1], folder / "D", time="mean-fps:20")
+    assert (summary.tracker, summary.held) == ("TRK", {})
+    np.testing.assert_array_equal(trace["a"].boxes, BOXES)
