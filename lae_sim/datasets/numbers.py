@@ -6,6 +6,7 @@ is refused with its file and line, since a shifted row shifts every frame after 
 
 from __future__ import annotations
 
+import codecs
 import re
 from pathlib import Path
 
@@ -13,8 +14,11 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.errors import LaeError
+from lae_sim.files import Budget
 
-_MAX_BYTES = 1 << 28
+# A cell as a str, and its place in a list.
+_CELL_BYTES = 64
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 # Lengths are bounded, so that no number needs more than moderate exact arithmetic.
 NUMBER = re.compile(r"[+-]?(?:[0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})(?:[eE][+-]?[0-9]{1,3})?\Z")
@@ -24,9 +28,11 @@ def read_cells(path: Path) -> list[list[str]]:
     """The cells of a text table, row by row; all rows have the same number of cells.
 
     Raises:
-        LaeError: if the file cannot be read, is empty, has an empty line inside, or is ragged.
+        LaeError: if the file cannot be read, is empty, has an empty line inside, is ragged, or
+            would take too much memory (see :func:`lae_sim.files.max_decoded`).
     """
-    lines = [line.strip() for line in _text(path).splitlines()]
+    budget = Budget(path)
+    lines = [line.strip() for line in _text(path, budget).splitlines()]
     while lines and not lines[-1]:
         lines.pop()
     if not lines:
@@ -41,6 +47,7 @@ def read_cells(path: Path) -> list[list[str]]:
                 f"{path}, line {number}: {len(row)} columns, and the lines before have "
                 f"{len(rows[0])}"
             )
+        budget.take(_CELL_BYTES * (len(row) + 1))
         rows.append(row)
     return rows
 
@@ -69,11 +76,14 @@ def _number(cell: str) -> float:
     return float(cell) if NUMBER.match(cell) else float("nan")
 
 
-def _text(path: Path) -> str:
+def _text(path: Path, budget: Budget) -> str:
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise LaeError(f"{path}: too large for a table of numbers")
-        return path.read_bytes().decode("utf-8-sig")
+        budget.take(path.stat().st_size)
+        data = path.read_bytes()
+        budget.take(len(data) + _CELL_BYTES * data.count(b"\n"))  # as text, and its lines
+        if data.startswith(_UTF16) or b"\0" in data[:4]:
+            raise LaeError(f"{path}: not a text file in UTF-8 but in UTF-16: save it as UTF-8")
+        return data.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise LaeError(f"{path}: no such file") from error
     except OSError as error:
