@@ -110,7 +110,7 @@ def within_budget(path: str | os.PathLike[str], size: int) -> None:
 
 
 def allowing(work: Callable[[Item], Result]) -> Callable[[Item], Result]:
-    """A function that does the work in another process with the budget of this one."""
+    """A function that does the work in another process or thread with the budget of this one."""
     return partial(_allowed, _MAX_DECODED.get(), work)
 
 

@@ -32,7 +32,7 @@ def read_cells(path: Path) -> list[list[str]]:
             would take too much memory (see :func:`lae_sim.files.max_decoded`).
     """
     budget = Budget(path)
-    lines = [line.strip() for line in _text(path, budget).splitlines()]
+    lines = [line.strip() for line in read_text(path, budget).splitlines()]
     while lines and not lines[-1]:
         lines.pop()
     if not lines:
@@ -76,7 +76,16 @@ def _number(cell: str) -> float:
     return float(cell) if NUMBER.match(cell) else float("nan")
 
 
-def _text(path: Path, budget: Budget) -> str:
+def read_text(path: Path, budget: Budget) -> str:
+    """A text file in UTF-8, with a mark at its beginning or without.
+
+    Args:
+        path: the file.
+        budget: what it and its lines take in memory is taken from it.
+
+    Raises:
+        LaeError: if it cannot be read, is no such text, or takes too much.
+    """
     try:
         budget.take(path.stat().st_size)
         data = path.read_bytes()

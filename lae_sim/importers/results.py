@@ -7,6 +7,7 @@ Each reader gives the boxes and, where the files have them, the times. Real-time
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -19,10 +20,10 @@ from zipfile import ZipFile
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.numbers import read_numbers
+from lae_sim.datasets.numbers import read_numbers, read_text
 from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
 from lae_sim.errors import LaeError
-from lae_sim.files import within_budget
+from lae_sim.files import Budget, within_budget
 from lae_sim.importers.matlab import load_matlab
 from lae_sim.importers.times import read_times
 
@@ -254,9 +255,8 @@ def _scalar(value: Any) -> float | None:
 def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | None, int]]]:
     """Sequence, frames (if stated) and time in ns of each row of a table of mean fps."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, ValueError, csv.Error) as error:
+        rows = list(csv.DictReader(io.StringIO(read_text(path, Budget(path)), newline="")))
+    except csv.Error as error:
         raise LaeError(f"{path}: cannot be read: {error}") from error
     if not rows or not {"sequence", "fps"} <= set(rows[0]):
         raise LaeError(f"{path}: needs a header with the columns sequence and fps")
