@@ -8,6 +8,7 @@ from .errors import LaeError, TraceError
 from .evaluation.evaluate import evaluate_runs
 from .evaluation.events import event_log
 from .evaluation.metrics import CONVENTIONS
+from .files import max_decoded
 from .forecast.base import Forecaster, Hold
 from .forecast.kalman import Kalman
 from .importers.convert import convert_results
@@ -52,6 +53,7 @@ __all__ = [
     "event_log",
     "find_dataset",
     "load_forecaster",
+    "max_decoded",
     "profile_tracker",
     "read_study",
     "read_trace",

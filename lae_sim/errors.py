@@ -54,7 +54,10 @@ def described(error: BaseException) -> str:
 
 def shown(value: object) -> str:
     """A value in one line of at most 60 characters."""
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # more digits than Python writes, or nested too deeply
+        text = f"a value of type {type(value).__name__}"
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 

@@ -22,6 +22,12 @@ settings.register_profile(
     print_blob=True,
     suppress_health_check=[HealthCheck.too_slow],
 )
+settings.register_profile(  # pytest tests/importers/test_hostile.py --hypothesis-profile fuzz
+    "fuzz",
+    parent=settings.get_profile("lae_sim"),
+    max_examples=int(os.environ.get("FUZZ_EXAMPLES", "20000")),
+    derandomize=False,
+)
 settings.load_profile("lae_sim")
 
 

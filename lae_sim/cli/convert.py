@@ -45,7 +45,7 @@ examples:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim convert``; see ``--help``."""
     arguments = _parser().parse_args(argv)
-    return exit_status(lambda: _convert(arguments), "lae-sim convert")
+    return exit_status(lambda: _convert(arguments), "lae-sim convert", arguments.max_decoded)
 
 
 def _parser() -> argparse.ArgumentParser:

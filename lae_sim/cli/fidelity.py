@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 2 for bad input."""
     arguments = parser().parse_args(argv)
-    return exit_status(lambda: _fidelity(arguments), PROGRAM)
+    return exit_status(lambda: _fidelity(arguments), PROGRAM, arguments.max_decoded)
 
 
 def _fidelity(arguments: argparse.Namespace) -> None:

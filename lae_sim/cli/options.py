@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 from lae_sim.engine.clock import parse_fps, parse_rational, whole
 from lae_sim.errors import LaeError
+from lae_sim.files import MAX_DECODED, max_decoded, parse_size
 from lae_sim.progress import tell
 
 if TYPE_CHECKING:
@@ -184,29 +185,47 @@ def argument(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
 
 
 def new_parser(program: str, description: str, examples: str) -> argparse.ArgumentParser:
-    """A command line's parser, whose help ends with examples."""
-    return argparse.ArgumentParser(
+    """A command line's parser, with the option that all have; its help ends with examples."""
+    made = argparse.ArgumentParser(
         prog=program,
         description=description,
         epilog=examples,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    made.add_argument(
+        "--max-decoded",
+        type=argument(parse_size),
+        default=MAX_DECODED,
+        metavar="SIZE",
+        help=f"how much memory a file that is read may take, decoded (default: {MAX_DECODED})",
+    )
+    return made
 
 
-def exit_status(work: Callable[[], None], program: str) -> int:
+def exit_status(work: Callable[[], None], program: str, decoded: int | str = MAX_DECODED) -> int:
     """Do the work of a command; its exit status is 0, 2 for an error, 130 for Ctrl-C.
 
-    An error is one or two lines on the standard error stream, without a traceback. Work prints when
-    it has written its files: that nobody reads what it prints is no error.
+    It is 1 where memory ran out. An error is one or two lines on the standard error stream, without
+    a traceback. Work prints when it has written its files: that nobody reads what it prints is no
+    error.
+
+    Args:
+        work: what the command does.
+        program: its name.
+        decoded: what a file may take in memory (see :func:`lae_sim.files.max_decoded`).
     """
     _occupy_closed_streams()
     try:
-        work()
+        with max_decoded(decoded):
+            work()
         if sys.stdout is not None:
             sys.stdout.flush()
     except KeyboardInterrupt:
         tell(f"{program}: interrupted")
         return 130
+    except MemoryError:
+        tell(f"{program}: error: out of memory: give it more, or fewer sequences or traces at once")
+        return 1
     except (LaeError, OSError) as error:
         if isinstance(error, BrokenPipeError) and _reader_gone(sys.stdout):  # such as head
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -175,7 +175,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 1 if sequences failed, 2 for bad input."""
     arguments = parser().parse_args(argv)
     failed: list[int] = []
-    status = exit_status(lambda: failed.append(_profile(arguments)), PROGRAM)
+    status = exit_status(lambda: failed.append(_profile(arguments)), PROGRAM, arguments.max_decoded)
     return status or int(any(failed))
 
 

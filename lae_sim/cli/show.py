@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="draw the times, or of gap passes the reach (.png, .svg, .pdf)",
     )
     arguments = parser.parse_args(argv)
-    return exit_status(lambda: _show(arguments), "lae-sim show")
+    return exit_status(lambda: _show(arguments), "lae-sim show", arguments.max_decoded)
 
 
 def _show(arguments: argparse.Namespace) -> None:

@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no worker stays behind
     failed: list[bool] = []
-    status = exit_status(lambda: failed.append(_study(arguments)), PROGRAM)
+    status = exit_status(lambda: failed.append(_study(arguments)), PROGRAM, arguments.max_decoded)
     if status == 130:
         tell("what is finished is kept: the same command goes on from there")
     return status or int(any(failed))

@@ -52,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 2 for bad input."""
     arguments = parser().parse_args(argv)
-    return exit_status(lambda: _train(arguments), PROGRAM)
+    return exit_status(lambda: _train(arguments), PROGRAM, arguments.max_decoded)
 
 
 def _train(arguments: argparse.Namespace) -> None:

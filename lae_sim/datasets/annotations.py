@@ -10,6 +10,7 @@ VOT workspace), UAVDT (``anno/<seq>_gt.txt``), UAV123, UAV123_10fps and UAV20L
 from __future__ import annotations
 
 import csv
+import io
 import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,8 +23,9 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats
 from lae_sim.datasets.foreign import HEAD_BYTES, foreign, foreign_columns
-from lae_sim.datasets.numbers import read_lines, read_numbers
+from lae_sim.datasets.numbers import read_lines, read_numbers, read_text
 from lae_sim.errors import LaeError
+from lae_sim.files import Budget
 
 _PER_SEQUENCE = re.compile(r"groundtruth(?:_rect)?(?:\.([0-9]))?\.txt\Z")
 _NOT_SEQUENCES = ("readme", "list", "license")
@@ -442,9 +444,8 @@ def _dataset(file: Path) -> str:
 
 def _from_csv(path: Path, sequences: Iterable[str]) -> dict[str, tuple[str, ...]]:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            header, *rows = csv.reader(file)
-    except (OSError, ValueError, csv.Error) as error:
+        header, *rows = csv.reader(io.StringIO(read_text(path, Budget(path)), newline=""))
+    except (ValueError, csv.Error) as error:
         raise LaeError(f"{path}: not a table of attributes: {error}") from error
     known = set(sequences)
     attributes = {}

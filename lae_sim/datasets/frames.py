@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import struct
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,8 +18,10 @@ import numpy.typing as npt
 
 from lae_sim._arrays import Floats
 from lae_sim.errors import LaeError
+from lae_sim.files import allowing, within_budget
 
 _THREADS = 4
+_PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG, _SCAN, _END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 Image = npt.NDArray[np.uint8]
@@ -76,7 +80,7 @@ def read_image(path: Path) -> Image:
     are of the stored pixels.
 
     Raises:
-        LaeError: if the file is missing, no image, or cut off.
+        LaeError: if the file is missing, no image, cut off, or takes too much memory.
     """
     import cv2
 
@@ -84,6 +88,7 @@ def read_image(path: Path) -> Image:
         data = path.read_bytes()
     except OSError as error:
         raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
+    within_budget(path, 3 * math.prod(_declared_size(data)))
     # Many builds of OpenCV decode a JPEG that was cut off, and fill the rest with grey.
     cut = data.startswith(_JPEG) and data.find(_END, max(data.rfind(_SCAN), 0)) < 0
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -94,6 +99,24 @@ def read_image(path: Path) -> Image:
         state = "empty" if not data else "cut off" if cut else "damaged, or no image"
         raise LaeError(f"{path}: cannot be decoded: the file is {state}")
     return np.asarray(image, np.uint8)
+
+
+def _declared_size(data: bytes) -> tuple[int, int]:
+    """Width and height that the head of a PNG, BMP or JPEG file declares; 0, 0 of any other."""
+    if data.startswith(_PNG) and len(data) >= 24:
+        width, height = struct.unpack_from(">II", data, 16)
+        return width, height
+    if data.startswith(b"BM") and len(data) >= 26:
+        width, height = struct.unpack_from("<ii", data, 18)
+        return abs(width), abs(height)  # a negative height means from the top
+    at = 2 if data.startswith(_JPEG) else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 1 if marker == 0xFF else 2 + length  # fill bytes, or another segment
+    return 0, 0
 
 
 class Video:
@@ -198,7 +221,8 @@ class Buffered:
             count = min(self._size, self._max_bytes // max(first.nbytes, 1))
             ahead = range(frame + step, min(frame + step * count, self._length), step)
             with ThreadPoolExecutor(_THREADS) as pool:
-                self._held = {frame: first, **dict(zip(ahead, pool.map(self._attempt, ahead)))}
+                read = allowing(self._attempt)
+                self._held = {frame: first, **dict(zip(ahead, pool.map(read, ahead)))}
         image = self._held[frame]
         if isinstance(image, Exception):
             raise image

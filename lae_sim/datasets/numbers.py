@@ -6,6 +6,7 @@ is refused with its file and line, since a shifted row shifts every frame after 
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,24 +16,27 @@ import numpy as np
 from lae_sim._arrays import Floats
 from lae_sim.datasets.foreign import HEAD_BYTES, foreign
 from lae_sim.errors import LaeError
+from lae_sim.files import Budget
 
-_MAX_BYTES = 1 << 28
+# A cell as a str, and its place in a list.
+_CELL_BYTES = 64
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 # 10,5;20,5 or 10,5 20,5: two numbers with decimal commas, or two points of a polygon?
 _COMMA = re.compile(r"[0-9],[0-9]")
 _NO_COMMA = re.compile(r"[0-9](?:\s*;\s*|\s+)[-+.0-9]")
 # Lengths are bounded, so that no number needs more than moderate exact arithmetic.
 NUMBER = re.compile(r"[+-]?(?:[0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})(?:[eE][+-]?[0-9]{1,3})?\Z")
-_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 def read_lines(path: Path) -> list[str]:
     """The lines of a text file, stripped, without empty ones at the end.
 
     Raises:
-        LaeError: if the file cannot be read, is empty, or looks like another format: it says which.
+        LaeError: if the file cannot be read, is empty, looks like another format: it says which, or
+            would take too much memory (see :func:`lae_sim.files.max_decoded`).
     """
-    lines = [line.strip() for line in _text(path).splitlines()]
+    lines = [line.strip() for line in read_text(path, Budget(path)).splitlines()]
     while lines and not lines[-1]:
         lines.pop()
     if not lines:
@@ -52,8 +56,10 @@ def read_cells(
         lines: of the file, if they have been read.
 
     Raises:
-        LaeError: if the file cannot be read, is empty, has an empty line inside, or is ragged.
+        LaeError: if the file cannot be read, is empty, has an empty line inside, is ragged, or
+            would take too much memory (see :func:`lae_sim.files.max_decoded`).
     """
+    budget = Budget(path)
     rows: list[list[str]] = []
     no_target: list[int] = []
     width = 0
@@ -66,6 +72,7 @@ def read_cells(
                 "write decimal points, and one separator"
             )
         row = _SEPARATOR.split(line.rstrip(",;").rstrip())
+        budget.take(_CELL_BYTES * (len(row) + 1))
         if absent and (row == ["0"] or {cell.lower() for cell in row} == {"nan"}):
             no_target.append(number - 1)
         elif len(row) != (width or len(row)):
@@ -118,16 +125,27 @@ def _number(cell: str) -> float:
     return float(cell) if NUMBER.match(cell) else float("nan")
 
 
-def _text(path: Path) -> str:
+def read_text(path: Path, budget: Budget) -> str:
+    """A text file in UTF-8, or in UTF-16 with a mark at its beginning.
+
+    Args:
+        path: the file.
+        budget: what it and its lines take in memory is taken from it.
+
+    Raises:
+        LaeError: if it cannot be read, is no such text, or takes too much.
+    """
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise LaeError(f"{path}: too large for a table of numbers")
+        budget.take(path.stat().st_size)
         data = path.read_bytes()
         other = foreign(data[:HEAD_BYTES])
         if other is not None:
             raise LaeError(f"{path}: {other}")
+        budget.take(len(data) + _CELL_BYTES * data.count(b"\n"))  # as text, and its lines
+        if not data.startswith(_UTF16) and b"\0" in data[:4]:
+            raise LaeError(f"{path}: not a text file in UTF-8 but in UTF-16: save it as UTF-8")
         # Windows' shell writes UTF-16
-        return data.decode("utf-16" if data[:2] in _UTF_16 else "utf-8-sig")
+        return data.decode("utf-16" if data.startswith(_UTF16) else "utf-8-sig")
     except FileNotFoundError as error:
         raise LaeError(f"{path}: no such file") from error
     except OSError as error:

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.errors import LaeError
+from lae_sim.files import Budget, TooLargeError
 
 if TYPE_CHECKING:
     import h5py
 
-_MAX_BYTES = 1 << 28
 _MAX_DEPTH = 16
 _MAX_CHUNKS = 4096
 _OBJECT_BYTES = 1024  # what reading an object costs at least, in time too
@@ -35,7 +35,8 @@ def load_hdf5(path: Path) -> dict[str, Any]:
     """The variables of a file by name, as :func:`lae_sim.importers.matlab.load_matlab` gives them.
 
     Raises:
-        LaeError: if h5py is not installed, or the file is damaged or larger than any result.
+        LaeError: if h5py is not installed, the file is damaged, or larger than any result (see
+            :func:`lae_sim.files.max_decoded`).
     """
     try:
         import h5py
@@ -46,19 +47,21 @@ def load_hdf5(path: Path) -> dict[str, Any]:
         ) from error
     try:
         with h5py.File(path, "r") as file:
-            return _Reader(h5py, file).members(file, 0)
+            return _Reader(h5py, file, Budget(path)).members(file, 0)
+    except TooLargeError:
+        raise
     except Exception as error:  # a damaged file can raise anything
         text = " ".join(str(error).split())[:200]
         raise LaeError(f"{path}: not a readable MATLAB file: {text}") from error
 
 
 class _Reader:
-    """Reads values of a file, as long as they are no more than a budget of bytes."""
+    """Reads values of a file within a budget."""
 
-    def __init__(self, h5: Any, file: h5py.File) -> None:
+    def __init__(self, h5: Any, file: h5py.File, budget: Budget) -> None:
         self._h5 = h5
         self._file = file
-        self._left = _MAX_BYTES
+        self._budget = budget
 
     def members(self, group: h5py.Group, depth: int) -> dict[str, Any]:
         """What a group holds by name, but for what MATLAB keeps for itself (``#refs#``)."""
@@ -74,7 +77,7 @@ class _Reader:
     def _value(self, item: Any, depth: int) -> Any:
         if depth > _MAX_DEPTH:
             raise ValueError("it is nested too deeply")
-        self._spend(_OBJECT_BYTES)
+        self._budget.take(_OBJECT_BYTES)
         if isinstance(item, self._h5.Group):
             return self._struct(item, depth)
         if not isinstance(item, self._h5.Dataset):
@@ -128,7 +131,7 @@ class _Reader:
         plan = dataset.id.get_create_plist()
         if plan.get_external_count() or dataset.is_virtual:
             raise ValueError("it has data in another file")
-        self._spend(math.prod(dataset.shape) * max(dataset.dtype.itemsize, _VALUE_BYTES))
+        self._budget.take(math.prod(dataset.shape) * max(dataset.dtype.itemsize, _VALUE_BYTES))
         if dataset.chunks:
             self._check_chunks(dataset, plan)
         return dataset[()]
@@ -136,23 +139,18 @@ class _Reader:
     def _check_chunks(self, dataset: h5py.Dataset, plan: Any) -> None:
         """Refuse chunks that unpack to more than their size, which HDF5 would find out too late."""
         size = math.prod(dataset.chunks) * dataset.dtype.itemsize
+        self._budget.take(size)
         filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
         packed = filters == [self._h5.h5z.FILTER_DEFLATE]
         if filters and not packed:
             raise ValueError("it is packed as MATLAB packs none")
         count = dataset.id.get_num_chunks()
-        if size > _MAX_BYTES or count > _MAX_CHUNKS:
-            raise ValueError("it is too large")
+        if count > _MAX_CHUNKS:
+            raise ValueError("it is in too many pieces")
         for i in range(count):
             chunk = dataset.id.get_chunk_info(i)
-            if chunk.size > _MAX_BYTES:
-                raise ValueError("it is too large")
+            self._budget.take(chunk.size)
             if packed and not chunk.filter_mask:
                 _, raw = dataset.id.read_direct_chunk(chunk.chunk_offset)
                 if len(zlib.decompressobj().decompress(raw, size + 1)) > size:
-                    raise ValueError("it is too large when unpacked")
-
-    def _spend(self, count: int) -> None:
-        self._left -= count
-        if self._left < 0:
-            raise ValueError("it is too large")
+                    raise ValueError("it unpacks to more than it says")

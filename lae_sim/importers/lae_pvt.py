@@ -13,12 +13,14 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.engine.clock import NS_PER_SECOND, Clock
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
+from lae_sim.files import within_budget
 from lae_sim.importers.pickles import load_plain
 from lae_sim.replay.run import replay_sequence
 from lae_sim.trace.recording import Recording
 
 _ROUNDING_NS = 2
+_OUTPUT_BYTES = 128  # of one number of an array as objects of Python
 
 
 @dataclass(frozen=True)
@@ -144,10 +146,16 @@ def _check_frames(path: Path, frames: list[int], length: int) -> None:
 
 def _column(path: Path, content: Mapping[Any, Any], key: str) -> list[tuple[int, Any]]:
     column = content.get(key)
+    if isinstance(column, (np.ndarray, list, tuple)):
+        within_budget(
+            path, _OUTPUT_BYTES * (column.size if isinstance(column, np.ndarray) else len(column))
+        )
     if isinstance(column, np.ndarray) and column.ndim:
         column = column.tolist()
     if not isinstance(column, (list, tuple)):
-        present = ", ".join(sorted(str(name)[:40] for name in content)[:8])
+        present = ", ".join(
+            sorted(str(key) if isinstance(key, str) else shown(key) for key in content)[:8]
+        )
         raise LaeError(f"{path}: no list {key!r} (it has {present or 'nothing'})")
     return list(enumerate(column))
 

@@ -17,11 +17,15 @@ from typing import Any
 import numpy as np
 
 from lae_sim.errors import LaeError
+from lae_sim.files import Budget
 from lae_sim.importers.hdf5 import load_hdf5
 
-_MAX_BYTES = 1 << 27
 _MAX_DEPTH = 16
+# What an array, a cell or a field takes as an object of Python, generously.
+_OBJECT_BYTES = 256
 _HEADER_BYTES = 128
+
+_MOST_SIZES = 32
 
 # Types of data elements.
 _MATRIX, _COMPRESSED = 14, 15
@@ -51,22 +55,24 @@ def load_matlab(path: Path) -> dict[str, Any]:
     lists in column order, a struct is a dict. Anything else is None.
 
     Raises:
-        LaeError: if the file is of another version, damaged, or larger than any result, or it is
-            of version 7.3 and h5py is not installed.
+        LaeError: if the file is of another version, damaged, or larger than any result (see
+            :func:`lae_sim.files.max_decoded`), or it is of version 7.3 and h5py is not installed.
     """
+    budget = Budget(path)
     try:
-        with path.open("rb") as file:
-            data = file.read(_MAX_BYTES + 1)
+        budget.take(path.stat().st_size)
+        data = memoryview(path.read_bytes())
     except OSError as error:
         raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if data.startswith(b"MATLAB 7.3") or data.startswith(b"\x89HDF"):
+    head = bytes(data[:_HEADER_BYTES])
+    if head.startswith((b"MATLAB 7.3", b"\x89HDF")):
         return load_hdf5(path)
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
-    if not data.startswith(b"MATLAB 5.0") or order is None:
+    order = {b"IM": "<", b"MI": ">"}.get(head[126:])
+    if not head.startswith(b"MATLAB 5.0") or order is None:
         raise LaeError(f"{path}: not a MATLAB file of version 5 to 7.3")
     try:
-        return _variables(data, order)
-    except (ValueError, struct.error, zlib.error, UnicodeError) as error:
+        return _variables(data, order, budget)
+    except (ValueError, OverflowError, struct.error, zlib.error, UnicodeError) as error:
         raise LaeError(f"{path}: not a readable MATLAB file: {error}") from error
 
 
@@ -74,14 +80,15 @@ def load_matlab(path: Path) -> dict[str, Any]:
 class _Elements:
     """Data elements one after the other; ``at`` is the next."""
 
-    data: bytes
+    data: memoryview
     order: str
+    budget: Budget
     at: int = 0
 
     def more(self) -> bool:
         return self.at < len(self.data)
 
-    def next(self) -> tuple[int, bytes]:
+    def next(self) -> tuple[int, memoryview]:
         """Type and content of the next element."""
         word, size = struct.unpack_from(f"{self.order}II", self.data, self.at)
         begin = self.at + 8
@@ -95,44 +102,50 @@ class _Elements:
         return word, content
 
 
-def _variables(data: bytes, order: str) -> dict[str, Any]:
-    if len(data) > _MAX_BYTES:
-        raise ValueError("it is too large")
-    budget = _MAX_BYTES
+def _variables(data: memoryview, order: str, budget: Budget) -> dict[str, Any]:
     variables = {}
-    elements = _Elements(data, order, _HEADER_BYTES)
+    elements = _Elements(data, order, budget, _HEADER_BYTES)
     while elements.more():
         kind, content = elements.next()
         if kind == _COMPRESSED:
-            content = zlib.decompressobj().decompress(content, budget + 1)
-            budget -= len(content)
-            if budget < 0:
-                raise ValueError("it is too large when unpacked")
-            kind, content = _Elements(content, order).next()
+            kind, content = _unpacked(content, order, budget)
         if kind == _MATRIX:
-            name, value = _matrix(content, order, 0)
+            name, value = _matrix(content, order, budget, 0)
             variables[name] = value
     return variables
 
 
-def _matrix(content: bytes, order: str, depth: int) -> tuple[str, Any]:
+def _unpacked(content: memoryview, order: str, budget: Budget) -> tuple[int, memoryview]:
+    """Type and content of the one element that a compressed one holds."""
+    unpack = zlib.decompressobj()
+    tag = unpack.decompress(content, 8)
+    size = struct.unpack(f"{order}II", tag)[1] if len(tag) == 8 else 0
+    budget.take(size)
+    rest = unpack.decompress(unpack.unconsumed_tail, size) if size else b""
+    return _Elements(memoryview(tag + rest), order, budget).next()
+
+
+def _matrix(content: memoryview, order: str, budget: Budget, depth: int) -> tuple[str, Any]:
     """Name and value of a matrix."""
+    budget.take(_OBJECT_BYTES)
     if depth > _MAX_DEPTH:
         raise ValueError("it is nested too deeply")
     if not content:
         return "", np.empty((0, 0))
-    parts = _Elements(content, order)
+    parts = _Elements(content, order, budget)
     flags = _sizes(parts)[0]
     shape = _sizes(parts)
     count = math.prod(shape)
     if len(shape) < 2 or min(shape) < 0 or count > len(content):
         raise ValueError("an array has a strange shape")
-    name = _text(*parts.next(), order)
+    name = _text(parts)
     kind = flags & 0xFF
     if kind in _NUMERIC and not flags & _COMPLEX_FLAG:
-        return name, _numbers(*parts.next(), order).astype(np.float64).reshape(shape, order="F")
+        numbers = _numbers(parts)
+        budget.take(len(numbers) * np.dtype(np.float64).itemsize)
+        return name, numbers.astype(np.float64).reshape(shape, order="F")
     if kind == _CHAR:
-        return name, _text(*parts.next(), order)
+        return name, _text(parts)
     if kind == _CELL:
         return name, [_child(parts, depth) for _ in range(count)]
     if kind == _STRUCT:
@@ -145,8 +158,9 @@ def _structs(parts: _Elements, count: int, depth: int) -> Any:
     _, names = parts.next()
     if width < 1:
         raise ValueError("a struct has fields without names")
+    parts.budget.take(_OBJECT_BYTES * (count + len(names) // width))
     fields = [
-        names[at : at + width].split(b"\0")[0].decode("latin-1")
+        bytes(names[at : at + width]).split(b"\0")[0].decode("latin-1")
         for at in range(0, len(names), width)
     ]
     structs = [{field: _child(parts, depth) for field in fields} for _ in range(count)]
@@ -157,28 +171,33 @@ def _child(parts: _Elements, depth: int) -> Any:
     kind, content = parts.next()
     if kind != _MATRIX:
         raise ValueError("a cell or field is not an array")
-    return _matrix(content, parts.order, depth + 1)[1]
+    return _matrix(content, parts.order, parts.budget, depth + 1)[1]
 
 
-def _numbers(kind: int, content: bytes, order: str) -> np.ndarray[Any, Any]:
+def _numbers(parts: _Elements) -> np.ndarray[Any, Any]:
+    """The numbers of the next element, of the type that they are stored in."""
+    kind, content = parts.next()
     if kind not in _NUMBERS:
         raise ValueError(f"type {kind} is not one of numbers")
-    numbers: np.ndarray[Any, Any] = np.frombuffer(content, np.dtype(order + _NUMBERS[kind]))
+    numbers: np.ndarray[Any, Any] = np.frombuffer(content, np.dtype(parts.order + _NUMBERS[kind]))
     return numbers
 
 
 def _sizes(parts: _Elements) -> tuple[int, ...]:
     """The integers of the next element, at least one."""
-    numbers = _numbers(*parts.next(), parts.order)
-    if not len(numbers) or numbers.dtype.kind == "f":
+    numbers = _numbers(parts)
+    if not 0 < len(numbers) <= _MOST_SIZES or numbers.dtype.kind == "f":
         raise ValueError("a size is missing")
     return tuple(numbers.tolist())
 
 
-def _text(kind: int, content: bytes, order: str) -> str:
+def _text(parts: _Elements) -> str:
+    """The text of the next element."""
+    kind, content = parts.next()
     if kind not in _TEXTS:
         raise ValueError(f"type {kind} is not one of text")
     encoding = _TEXTS[kind]
     if encoding in ("utf-16", "utf-32"):
-        encoding += "-le" if order == "<" else "-be"
-    return content.decode(encoding)
+        encoding += "-le" if parts.order == "<" else "-be"
+    parts.budget.take(4 * len(content))  # a str has up to four bytes for each
+    return bytes(content).decode(encoding)

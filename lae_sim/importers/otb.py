@@ -22,8 +22,9 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.errors import LaeError, shown
+from lae_sim.files import within_budget
 
-_MAX_JSON_BYTES = 1 << 25  # as Python's lists it takes some eight times as much
+_BYTES_PER_CHARACTER = 32  # of what Python makes of JSON such as [1,{},[]]
 
 
 @dataclass(frozen=True)
@@ -43,14 +44,12 @@ def load_json(path: Path) -> Any:
     """The values of a JSON file.
 
     Raises:
-        LaeError: if it is damaged, or larger than any result.
+        LaeError: if it is damaged, or larger than any result (see
+            :func:`lae_sim.files.max_decoded`).
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(_MAX_JSON_BYTES + 1)
-        if len(data) > _MAX_JSON_BYTES:
-            raise LaeError(f"{path}: larger than {_MAX_JSON_BYTES >> 20} MB of JSON")
-        return json.loads(data, parse_int=float)
+        within_budget(path, path.stat().st_size * _BYTES_PER_CHARACTER)
+        return json.loads(path.read_bytes(), parse_int=float)
     except OSError as error:
         raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:

@@ -19,10 +19,11 @@ import numpy as np
 
 from lae_sim.datasets.foreign import told_apart
 from lae_sim.errors import LaeError
+from lae_sim.files import Budget, TooLargeError
 
-_MAX_BYTES = 1 << 26
-_MAX_OPERATIONS = 10_000_000
 _MAX_DEPTH = 32
+# What an operation may leave in memory: an empty dict, the same decoded, and places in lists.
+_OPERATION_BYTES = 160
 _NUMERIC = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])\Z")
 
 
@@ -93,34 +94,37 @@ def load_plain(path: Path) -> Any:
         LaeError: if the file asks for anything else, which it names, or is damaged.
     """
     with told_apart(path, b"\x80"):
-        try:
-            if path.stat().st_size > _MAX_BYTES:
-                raise LaeError(f"is larger than {_MAX_BYTES >> 20} MB")
-            data = path.read_bytes()
-            _check_operations(data)
-            # Python 2 keeps bytes and text alike; latin1 keeps every byte.
-            return _Decoder().decode(_Unpickler(io.BytesIO(data), encoding="latin1").load())
-        except LaeError as error:
-            raise LaeError(
-                f"{path}: {error}: a pickle of results may hold numbers, text, lists, dicts and "
-                "numeric NumPy arrays only"
-            ) from error
-        except FileNotFoundError as error:
-            raise LaeError(f"{path}: no such file") from error
-        except Exception as error:  # a hostile pickle can raise anything
-            raise LaeError(
-                f"{path}: not a readable pickle: {ascii(str(error))[1:-1][:200]}"
-            ) from error
+        return _loaded(path, Budget(path))
 
 
-def _check_operations(data: bytes) -> None:
+def _loaded(path: Path, budget: Budget) -> Any:
+    try:
+        budget.take(path.stat().st_size)
+        data = path.read_bytes()
+        _check_operations(data, budget)
+        # Python 2 keeps bytes and text alike; latin1 keeps every byte.
+        return _Decoder().decode(_Unpickler(io.BytesIO(data), encoding="latin1").load())
+    except TooLargeError:
+        raise
+    except LaeError as error:
+        raise LaeError(
+            f"{path}: {error}: a pickle of results may hold numbers, text, lists, dicts and "
+            "numeric NumPy arrays only"
+        ) from error
+    except FileNotFoundError as error:
+        raise LaeError(f"{path}: no such file") from error
+    except Exception as error:  # a hostile pickle can raise anything
+        raise LaeError(f"{path}: not a readable pickle: {ascii(str(error))[1:-1][:200]}") from error
+
+
+def _check_operations(data: bytes, budget: Budget) -> None:
     """Refuse what could exhaust memory before a single object is made.
 
     ``genops`` only reads; it stops where the file ends before a declared length.
     """
     for count, (opcode, argument, _) in enumerate(pickletools.genops(data), 1):
-        if count > _MAX_OPERATIONS:
-            raise LaeError(f"has more than {_MAX_OPERATIONS} operations")
+        size = len(argument) if isinstance(argument, (bytes, str)) else 0
+        budget.take(_OPERATION_BYTES + 4 * size)  # text has up to four bytes for each
         if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > count:
             raise LaeError(f"asks for {argument} places in memory")
         if "PERSID" in opcode.name or opcode.name.startswith("EXT"):

@@ -7,6 +7,8 @@ Each reader gives the boxes and, where the files have them, the times. Real-time
 from __future__ import annotations
 
 import csv
+import io
+import math
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -14,15 +16,16 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.foreign import HEAD_BYTES, Foreign, foreign, foreign_columns, told_apart
-from lae_sim.datasets.numbers import read_lines, read_numbers
+from lae_sim.datasets.numbers import read_lines, read_numbers, read_text
 from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
 from lae_sim.errors import LaeError
+from lae_sim.files import Budget, within_budget
 from lae_sim.importers.matlab import load_matlab
 from lae_sim.importers.otb import load_json, read_run
 from lae_sim.importers.times import read_times
@@ -40,7 +43,6 @@ _SUFFIXES = {
 }
 # What toolkits write beside the boxes.
 _NOT_BOXES = ("_time", "_all_boxes", "_all_scores", "_scores", "_confidence", "_conf")
-_MAX_NPZ_BYTES = 1 << 31
 # What the VOT toolkit writes in place of a region: nothing known, the tracker starts, it failed.
 _VOT_UNKNOWN, _VOT_START, _VOT_FAILED = "0", "1", "2"
 _SIGNED_NAN = re.compile(r"[-+]?\bnan\b(?:\(ind\))?", re.IGNORECASE)  # C's printf
@@ -255,9 +257,8 @@ def _text_boxes(path: Path) -> Floats:
 def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | None, int]]]:
     """Sequence, frames (if stated) and time in ns of each row of a table of mean fps."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, ValueError, csv.Error) as error:
+        rows = list(csv.DictReader(io.StringIO(read_text(path, Budget(path)), newline="")))
+    except csv.Error as error:
         raise LaeError(f"{path}: cannot be read: {error}") from error
     if not rows or not {"sequence", "fps"} <= set(rows[0]):
         raise LaeError(f"{path}: needs a header with the columns sequence and fps")
@@ -337,7 +338,7 @@ def _checked_boxes(boxes: Any, where: str) -> Floats:
         raise LaeError(f"{where}: boxes must be a table of numbers")
     if boxes.shape[1] != 4:
         raise LaeError(f"{where}: {boxes.shape[1]} columns; boxes have 4: x, y, w, h")
-    table = boxes.astype(np.float64)
+    table = boxes.astype(np.float64, copy=False)
     lost = np.isnan(table).all(axis=1)
     bad = np.flatnonzero(~np.isfinite(table).all(axis=1) & ~lost)
     if len(bad):
@@ -355,17 +356,35 @@ def _npz_names(path: Path) -> list[str]:
         try:
             with ZipFile(path) as archive:
                 entries = archive.infolist()
-        except (OSError, BadZipFile, ValueError) as error:
+        except Exception as error:  # a damaged file can raise anything
             raise LaeError(f"{path}: not a readable .npz file: {error}") from error
-    if sum(entry.file_size for entry in entries) > _MAX_NPZ_BYTES:
-        raise LaeError(f"{path}: unpacks to more than {_MAX_NPZ_BYTES >> 20} MB")
+    within_budget(path, sum(entry.file_size for entry in entries))
     return [entry.filename.removesuffix(".npy") for entry in entries]
 
 
 def _npz_boxes(path: Path, name: str) -> Floats:
     try:
-        with np.load(path, allow_pickle=False) as content:
-            boxes = content[name]
+        with ZipFile(path) as archive:
+            member = f"{name}.npy" if f"{name}.npy" in archive.NameToInfo else name
+            with archive.open(member) as file:
+                shape, kind = _npy_header(file)
+            # as it is stored, and as float64
+            within_budget(path, math.prod(shape) * (kind.itemsize + np.dtype(np.float64).itemsize))
+            with archive.open(member) as file:
+                boxes = np.lib.format.read_array(file, allow_pickle=False)
+    except LaeError:
+        raise
     except Exception as error:  # a damaged file can raise anything
         raise LaeError(f"{path}: array {name[:80]!r} cannot be read: {error}") from error
     return _checked_boxes(boxes, f"{path}, array {name!r}")
+
+
+def _npy_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of an array of NumPy's format."""
+    version = np.lib.format.read_magic(file)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }[version]
+    shape, _, kind = read(file)
+    return shape, kind

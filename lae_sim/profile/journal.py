@@ -49,7 +49,7 @@ class Journal:
             )
         try:
             before = dict(json.loads((folder / _SETTINGS).read_text()))
-        except (OSError, ValueError, TypeError) as error:
+        except (OSError, ValueError, TypeError, RecursionError) as error:
             raise LaeError(
                 f"{folder}: cannot be resumed, remove it to start anew: {error}"
             ) from error
@@ -76,7 +76,7 @@ class Journal:
             decide: makes a JSON object.
         """
         path = self._folder / f"{name}.json"
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ValueError, TypeError, RecursionError):
             return dict(json.loads(path.read_text()))
         decision = decide()
         with written_whole(path) as temporary:

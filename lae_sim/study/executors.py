@@ -13,6 +13,7 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from lae_sim.errors import LaeError
+from lae_sim.files import allowing
 
 AHEAD = 3
 """Tasks that are handed out for each worker, so that none waits and few results are held."""
@@ -60,6 +61,7 @@ def _handed_out(
 ) -> Iterator[tuple[Item, Any]]:
     """Each item with what a function makes of it, by as many workers as there are at the moment."""
     waiting = iter(items)
+    work = allowing(work)
     running: dict[Future[Any], Item] = {}
     try:
         while True:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -16,6 +17,7 @@ from lae_sim.engine.clock import exact, parse_duration, parse_fps, split_init, w
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
+from lae_sim.files import within_budget
 from lae_sim.replay.search import parse_search
 from lae_sim.replay.world import (
     check_sigmas,
@@ -32,6 +34,8 @@ from lae_sim.trace.file import Trace
 
 RANDOM = ("bootstrap", "resample", "lognormal")
 """Latencies that are drawn anew in each repetition."""
+
+_NESTED_KEY = re.compile(r"(?:[\w\"'-]+[ \t]*\.[ \t]*){32}")
 
 Value = TypeVar("Value")
 
@@ -200,14 +204,19 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     if not isinstance(path, (str, os.PathLike)):
         raise LaeError(f"path: a study is read from a TOML file, not {shown(path)}")
     try:
-        content = Path(path).read_text("utf-8")
+        within_budget(path, os.stat(path).st_size)
+        content = Path(path).read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise LaeError(f"{path}: cannot be read: {error}") from error
     try:
+        if _NESTED_KEY.search(content):  # for which tomllib takes the square of its length
+            raise RecursionError
         # numbers stay as they are written: no float comes between
         document = tomllib.loads(content, parse_float=str)
         return Study.of(document)
-    except (tomllib.TOMLDecodeError, LaeError) as error:
+    except RecursionError as error:
+        raise LaeError(f"{path}: is nested too deeply for a study") from error
+    except (ValueError, LaeError) as error:  # ValueError also of a number of thousands of digits
         raise LaeError(f"{path}: {error}") from error
 
 

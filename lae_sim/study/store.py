@@ -112,7 +112,7 @@ class Store:
     def _read(self, path: Path) -> dict[str, Any]:
         try:
             document: dict[str, Any] = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise LaeError(f"{path}: cannot be read: {error}; delete it") from error
         return document
 

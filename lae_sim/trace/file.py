@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.errors import LaeError, TraceError, hint, shown
-from lae_sim.files import sequence_names, written_whole
+from lae_sim.files import Budget, sequence_names, written_whole
 from lae_sim.trace.checks import COLUMN_TYPES, RowChecker, check_schema
 from lae_sim.trace.columns import BOX, TRUTH, Rows, checksums
 from lae_sim.trace.locate import is_url, opened
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 HELD_FRAMES = 1 << 18
+_ROW_BYTES = 8 + 3 * 8 * 4 + 4  # truth, box and what is put together of them, time and score
+_JSON_FACTOR = 8  # objects of Python take more than their text
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -270,6 +272,7 @@ class _StoredRecordings:
                     f"{self.path}: metadata key 'lae_sim' is missing: is this a lae_sim trace? "
                     "See 'lae-sim convert --help' to make one"
                 )
+            Budget(self.path, TraceError).take(_JSON_FACTOR * len(stored))
             try:
                 return Metadata.parse(stored), file.metadata.num_rows
             except TraceError as error:
@@ -283,6 +286,7 @@ class _StoredRecordings:
         """
         found: dict[str, int] = {}
         with self._opened() as file:
+            self._check_sizes(file.metadata.row_group(g) for g in range(file.num_row_groups))
             for batch in file.iter_batches(2 * BATCH_ROWS, columns=["sequence"], use_threads=False):
                 for each in batch.column(0).value_counts().to_pylist():
                     found[each["values"]] = found.get(each["values"], 0) + each["counts"]
@@ -317,12 +321,14 @@ class _StoredRecordings:
         """Recordings, put together again where a batch ends inside one."""
         check = RowChecker(self.path, self.profiled, self.restarts)
         parts: list[Recording] = []
+        budget = Budget(self.path, TraceError)
         for rows in self._rows():
             check(rows)
             for recording in rows.recordings():
                 if parts and recording.name != parts[0].name:
                     yield _joined(parts)
-                    parts = []
+                    parts, budget = [], Budget(self.path, TraceError)
+                budget.take(_ROW_BYTES * len(recording))
                 parts.append(recording)
         if not parts:
             raise TraceError(f"{self.path}: the trace is empty")
@@ -331,14 +337,23 @@ class _StoredRecordings:
     def _rows(self) -> Iterator[Rows]:
         with self._opened() as file:
             present = [name for name in COLUMN_TYPES if name in file.schema_arrow.names]
-            groups = (file.metadata.row_group(g) for g in range(file.num_row_groups))
+            groups = [file.metadata.row_group(g) for g in range(file.num_row_groups)]
             if sum(group.num_rows for group in groups) != file.metadata.num_rows:
                 raise TraceError(f"{self.path}: the file is damaged: its row counts disagree")
+            self._check_sizes(groups)
             # twice, since row groups end with the sequence that fills them
             batches = file.iter_batches(2 * BATCH_ROWS, columns=present, use_threads=False)
             for batch in batches:
                 if batch.num_rows:
                     yield Rows.of_batch(batch)
+
+    def _check_sizes(self, groups: Iterable[Any]) -> None:
+        """Check what a column of a row group takes, of which a page is decoded at a time."""
+        for group in groups:
+            budget = Budget(self.path, TraceError)
+            if group.total_byte_size > budget.left:  # uncompressed
+                columns = (group.column(c) for c in range(group.num_columns))
+                budget.take(max(column.total_uncompressed_size for column in columns))
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:

@@ -1,8 +1,11 @@
 from fractions import Fraction
 
+import numpy as np
 import pytest
 
 import lae_sim
+from lae_sim.cli.main import COMMANDS, main
+from lae_sim.cli.options import exit_status
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.replay.latency import bootstrap, lognormal, resampled
@@ -106,3 +109,30 @@ def test_a_policy_that_is_none_is_an_error_that_quotes_it(text):
 def test_a_latency_that_is_none_is_an_error(text):
     with pytest.raises(lae_sim.LaeError):
         parse_latency(text)
+
+
+def test_running_out_of_memory_is_one_line(capsys):
+    def python():
+        raise MemoryError
+
+    def numpy():
+        np.empty(1 << 52)
+
+    for work in (python, numpy):
+        assert exit_status(work, "lae-sim show") == 1
+        assert capsys.readouterr().err.startswith("lae-sim show: error: out of memory: give it")
+
+
+def test_every_command_takes_what_a_file_may_take(tmp_path, capsys):
+    path = str(tmp_path / "trace.parquet")
+    lae_sim.write_trace(lae_sim.Trace(lae_sim.Metadata.new("30", "every-frame"), [RECORDING]), path)
+    for command in (["show", path], ["replay", path], ["compare", path, "--forecaster", "kalman"]):
+        assert main([*command, "--max-decoded", "300"]) == 2
+        assert "would take more than 0.0002861 MiB" in capsys.readouterr().err
+        with pytest.raises(SystemExit):
+            main([*command, "--max-decoded", "much"])
+        assert "--max-decoded: 'much' is no size in memory" in capsys.readouterr().err
+    for command in COMMANDS:
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        assert "--max-decoded SIZE" in capsys.readouterr().out

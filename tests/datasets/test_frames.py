@@ -6,6 +6,7 @@ import pytest
 
 from lae_sim.datasets.frames import Buffered, Video, read_image
 from lae_sim.errors import LaeError
+from lae_sim.files import max_decoded
 
 cv2 = pytest.importorskip("cv2", reason="frames are decoded with OpenCV")
 
@@ -32,6 +33,29 @@ def test_grey_and_16_bit_images_become_colour_of_8_bit(tmp_path, suffix):
     assert np.abs(image - (deep / 257)[..., None]).max() < 1
     cv2.imwrite(str(path), (deep >> 8).astype(np.uint8))
     assert np.array_equal(read_image(path)[..., 1], deep >> 8)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "bmp"])
+def test_an_image_that_would_take_too_much_memory(tmp_path, suffix):
+    path = tmp_path / f"1.{suffix}"
+    cv2.imwrite(str(path), np.zeros((600, 700, 3), np.uint8))
+    with max_decoded(3 * 600 * 700):
+        assert read_image(path).shape == (600, 700, 3)
+    with (
+        max_decoded("1MiB"),
+        pytest.raises(LaeError, match=rf"1\.{suffix}: would take more than 1"),
+    ):
+        read_image(path)
+
+
+def test_frames_that_are_read_ahead_may_take_as_much(tmp_path):
+    for frame in range(6):
+        cv2.imwrite(str(tmp_path / f"{frame}.png"), np.full((40, 50, 3), frame, np.uint8))
+    with max_decoded(3 * 40 * 50):
+        buffered = Buffered(lambda frame: read_image(tmp_path / f"{frame}.png"), 6)
+        assert [int(buffered(frame)[0, 0, 0]) for frame in range(6)] == list(range(6))
+    with max_decoded(3 * 40 * 50 - 1), pytest.raises(LaeError, match="would take more"):
+        buffered = Buffered(lambda frame: read_image(tmp_path / f"{frame}.png"), 6)(0)
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "bmp"])

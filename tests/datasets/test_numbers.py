@@ -3,6 +3,7 @@ import pytest
 
 from lae_sim.datasets.numbers import read_numbers
 from lae_sim.errors import LaeError
+from lae_sim.files import max_decoded
 
 
 @pytest.fixture
@@ -79,6 +80,24 @@ def test_rows_without_a_target_where_allowed(written):
 def test_no_table(written, text, problem):
     with pytest.raises(LaeError, match=problem):
         read_numbers(written(text))
+
+
+def test_utf_16_without_a_mark_is_named(written):
+    for encoding in ("utf-16-le", "utf-16-be"):
+        with pytest.raises(LaeError, match="in UTF-16: save it as UTF-8"):
+            read_numbers(written("1,2\n3,4\n".encode(encoding)))
+
+
+def test_a_table_that_would_take_too_much_memory(written):
+    path = written("1,2,3,4\n" * 20_000)
+    with max_decoded("9MiB"):
+        assert read_numbers(path).shape == (20_000, 4)
+    for size in ("100KiB", "1MiB", "4MiB"):
+        with (
+            max_decoded(size),
+            pytest.raises(LaeError, match=r"table\.txt: would take more than .* of memory"),
+        ):
+            read_numbers(path)
 
 
 def test_no_file(tmp_path):

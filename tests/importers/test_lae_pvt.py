@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
+from lae_sim.files import max_decoded
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.replay.run import replay_sequence
 
@@ -195,3 +196,22 @@ def test_timestamps_on_frame_boundaries(read):
         assert all(a < b for a, b in pairwise(run["input_fidx"]))
         schedule = replay_sequence(read(run, 50).recording, CLOCK).schedule
         assert schedule.frames.tolist() == run["input_fidx"]
+
+
+def test_keys_and_values_that_python_does_not_write_out(read):
+    huge = 10**5000
+    with pytest.raises(LaeError, match=r"no list 'input_fidx' \(it has a value of type int"):
+        read({huge: 1}, 3)
+    for key in ("input_fidx", "timestamps", "results_raw", "runtime"):
+        run = released_loop(3, 30, [0], [0.01])
+        run[key] = [huge] * len(run[key])
+        if key == "runtime":
+            run["timestamps"][0] = 0
+        with pytest.raises(LaeError, match=r"seq\.pkl"):
+            read(run, 3)
+
+
+def test_an_array_that_would_take_too_much_memory_as_numbers(read):
+    run = {"input_fidx": np.zeros(20_000, np.int8), "timestamps": [0.1], "results_raw": [[0] * 4]}
+    with max_decoded("1MiB"), pytest.raises(LaeError, match=r"seq\.pkl: would take more"):
+        read(run, 3)

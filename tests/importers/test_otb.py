@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from lae_sim.errors import LaeError
+from lae_sim.files import TooLargeError, max_decoded
 from lae_sim.importers.otb import load_json, read_run
 
 SQUARE = np.array([[10, 50, 50, 10], [20, 20, 60, 60]], float)  # x and y of its corners
@@ -121,6 +122,6 @@ def test_numbers_of_any_length_are_read(tmp_path: Path) -> None:
 
 def test_large_json_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
-    path.write_bytes(b" " * ((1 << 25) + 1))
-    with pytest.raises(LaeError, match="larger than 32 MB of JSON"):
+    path.write_text("[1, 2, 3, 4]")
+    with max_decoded(64), pytest.raises(TooLargeError, match=r"a\.json"):
         load_json(path)

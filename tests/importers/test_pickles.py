@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from lae_sim.errors import LaeError
+from lae_sim.files import max_decoded
 from lae_sim.importers.pickles import load_plain
 
 
@@ -270,9 +271,17 @@ def test_changed_bytes_are_values_or_errors(tmp_path_factory, data):
 def test_size_is_limited(tmp_path):
     path = tmp_path / "huge.pkl"
     with path.open("wb") as file:
-        file.truncate(1 << 27)
-    with pytest.raises(LaeError, match="larger than 64 MB"):
+        file.truncate((256 << 20) + 1)
+    with pytest.raises(LaeError, match=r"huge\.pkl: would take more than 256 MiB of memory"):
         load_plain(path)
+    lists = b"\x80\x02(" + b"]" * 20_000 + b"l."
+    path.write_bytes(lists)
+    with max_decoded("4MiB"):
+        assert len(load_plain(path)) == 20_000
+        for data in (lists.replace(b"(", b"(" + b"]" * 20_000), pickle.dumps("t" * 1_500_000)):
+            path.write_bytes(data)
+            with pytest.raises(LaeError, match="more than 4 MiB"):
+                load_plain(path)
     with pytest.raises(LaeError, match="no such file"):
         load_plain(tmp_path / "none.pkl")
 

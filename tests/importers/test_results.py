@@ -2,6 +2,8 @@ import contextlib
 import io
 import json
 import struct
+import subprocess
+import sys
 import zipfile
 import zlib
 from fractions import Fraction
@@ -13,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lae_sim.errors import LaeError
+from lae_sim.files import max_decoded
 from lae_sim.importers.pickles import load_plain
 from lae_sim.importers.results import Source, find_results, given_times, read_results
 
@@ -107,18 +110,29 @@ def test_npz_faults(tmp_path, array, problem):
         read(tmp_path / "KCF.npz")
 
 
+def write_npz(path, kind, shape, data=b""):
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": kind, "fortran_order": False, "shape": shape}
+    )
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", header.getvalue() + data)
+
+
 def test_npz_bombs_and_damage(tmp_path):
     path = tmp_path / "a.npz"
     path.write_bytes(b"PK no zip")
     with pytest.raises(LaeError, match=r"not a readable \.npz"):
         read(path)
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 34, 4)}
-    )
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("a.npy", header.getvalue())
-    with pytest.raises(LaeError, match="cannot be read"):
+    write_npz(path, "<f8", (1 << 34, 4))
+    with pytest.raises(LaeError, match=r"a\.npz: would take more than 256 MiB"):
+        read(path)
+    for kind, shape in (("|i1", (250_000, 4)), ("<f8", (250_000, 4)), ("<f8", (2**62, 2**62))):
+        write_npz(path, kind, shape, bytes(1_000_000))
+        with max_decoded("4MiB"), pytest.raises(LaeError, match=r"a\.npz: would take more than 4"):
+            read(path)
+    write_npz(path, "<f8", (-1, 4), bytes(32))
+    with pytest.raises(LaeError, match=r"a\.npz: array 'a' cannot be read"):
         read(path)
 
 
@@ -217,13 +231,62 @@ def test_nested_mat(tmp_path, pack):
         read_mat(path)
 
 
-def test_mat_bomb(tmp_path):
+def array(kind, shape, *parts):
+    """A data element: an array of the class ``kind``, called ``res``."""
+    head = element(6, struct.pack("<II", kind, 0))
+    head += element(5, struct.pack(f"<{len(shape)}i", *shape)) + element(1, b"res")
+    return element(14, head + b"".join(parts))
+
+
+COUNT = 100_000
+EMPTY = element(14, b"") * COUNT
+BOMBS = {
+    "zeros": array(6, (COUNT, 80), element(9, bytes(COUNT * 80 * 8))),
+    "bytes that become floats": array(6, (COUNT, 8), element(2, bytes(COUNT * 8))),
+    "a text": array(4, (1, 9 * COUNT), element(16, bytes(9 * COUNT))),
+    "cells": array(1, (1, COUNT), EMPTY),
+    "structs": array(2, (1, COUNT), element(5, struct.pack("<i", 2)), element(1, b"a\0"), EMPTY),
+    "fields": array(2, (1, 1), element(5, struct.pack("<i", 2)), element(1, b"a\0" * COUNT), EMPTY),
+    "variables": [array(6, (COUNT, 1), element(2, bytes(COUNT)))] * 6,
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_mat_bombs(tmp_path, name):
     path = tmp_path / "a.mat"
-    packer = zlib.compressobj(9)
-    bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(140)) + packer.flush()
-    path.write_bytes(HEADER + packed(bomb))
-    with pytest.raises(LaeError, match="too large"):
+    variables = BOMBS[name] if isinstance(BOMBS[name], list) else [BOMBS[name]]
+    path.write_bytes(HEADER + b"".join(packed(zlib.compress(each, 9)) for each in variables))
+    assert path.stat().st_size < 70_000
+    with max_decoded("4MiB"), pytest.raises(LaeError, match=r"a\.mat: would take more than 4 MiB"):
         read_mat(path)
+
+
+def test_a_mat_file_of_a_usual_size_is_within_the_least_budget(tmp_path):
+    path = tmp_path / "a.mat"
+    run = {"res": np.tile(BOXES, (5000, 1)), "fps": 20.5, "type": "rect", "len": 10_000}
+    scipy.io.savemat(path, {"results": np.array([run], dtype=object)}, do_compression=True)
+    with max_decoded("1MiB"):
+        assert len(read_mat(path).boxes) == 10_000
+
+
+def test_a_mat_bomb_takes_no_memory(tmp_path):
+    path = tmp_path / "a.mat"
+    count = 2_000_000
+    cells = array(1, (1, count), element(14, b"") * count)
+    path.write_bytes(HEADER + packed(zlib.compress(cells, 9)))
+    code = (
+        "import resource, sys; from pathlib import Path\n"
+        "from lae_sim.importers.matlab import load_matlab\n"
+        "from lae_sim.errors import LaeError\n"
+        "from lae_sim.files import max_decoded\n"
+        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10\n"
+        "before = peak()\n"
+        "try:\n"
+        "    with max_decoded('32MiB'): load_matlab(Path(sys.argv[1]))\n"
+        "except LaeError: print(peak() - before)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, check=True)
+    assert int(done.stdout) < 48  # 400 MiB when read in full
 
 
 @given(st.data())

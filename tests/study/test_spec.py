@@ -154,3 +154,26 @@ def test_whatever_is_given_is_a_study_or_an_error(document: dict[str, Any]) -> N
     except LaeError:
         return
     assert isinstance(study, Study)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"traces = {'[' * 5000}{']' * 5000}",
+        f"traces = {'{a=' * 5000}1{'}' * 5000}",
+        f"{'a.' * 100_000}a = 1",
+        f"[{'a . ' * 100_000}a]",
+        f"[[{'a.' * 100_000}a]]",
+        f"seed = {'9' * 5000}",  # Exceeds the limit, in all but the first of Python 3.10
+    ],
+    ids=lambda text: text[:9],
+)
+def test_hostile_files_are_refused_quickly(tmp_path: Path, text: str) -> None:
+    with pytest.raises(
+        LaeError, match=r"study\.toml: (is nested too deeply|Exceeds the limit|seed: )"
+    ):
+        read_study(written(tmp_path, text))
+
+
+def test_a_mark_of_the_encoding_is_skipped(tmp_path: Path) -> None:
+    assert read_study(written(tmp_path, '\ufefftraces = "a.parquet"')).traces == ("a.parquet",)

@@ -16,6 +16,7 @@ from witness import BOX, MINIMAL, TRUTH, TYPES, assert_same, columns_of, moving,
 
 import lae_sim.trace.file
 from lae_sim.errors import LaeError, TraceError
+from lae_sim.files import max_decoded
 from lae_sim.trace.file import Trace, read_trace, validate, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording, batched
@@ -409,3 +410,28 @@ def test_batched_keeps_the_order_and_closes_a_group_once_it_is_full(
     for group in groups[:-1]:
         assert sum(map(len, group)) >= rows > sum(map(len, group[:-1]))
     assert all(groups)
+
+
+def test_a_sequence_that_would_take_too_much_memory(path: Path) -> None:
+    write_trace(Trace(EVERY, [sparse(9000, 1, "a"), sparse(9000, 2, "b")]), path)
+    with max_decoded("1MiB"):  # it counts one sequence at a time
+        assert len(list(read_trace(path))) == 2
+    with max_decoded("900KiB"), pytest.raises(TraceError, match=r"trace\.parquet: would take more"):
+        list(read_trace(path))
+
+
+def test_a_column_that_would_take_too_much_memory(path: Path) -> None:
+    columns = columns_of([moving(40, 1, "a")])
+    columns["sequence"] = ["a" * 3_000_000] * 40
+    write_plain(path, columns)
+    for read in (list, lambda trace: trace.names):
+        with max_decoded("1MiB"), pytest.raises(TraceError, match=r"trace\.parquet: would take"):
+            read(read_trace(path))
+
+
+def test_metadata_that_would_take_too_much_memory(path: Path) -> None:
+    many = {f"s{k}": {"attributes": ["x"]} for k in range(9000)}
+    write_trace(Trace(Metadata.new("30", "every-frame", sequences=many), [sparse(9)]), path)
+    with max_decoded("1MiB"), pytest.raises(TraceError, match=r"trace\.parquet: would take more"):
+        read_trace(path)
+    assert len(read_trace(path)) == 1
