@@ -99,7 +99,7 @@ def load_plain(path: Path) -> Any:
         _check_operations(data, budget)
         # Python 2 keeps bytes and text alike; latin1 keeps every byte.
         return _Decoder().decode(_Unpickler(io.BytesIO(data), encoding="latin1").load())
-    except TooLargeError:
+    except (TooLargeError, MemoryError):
         raise
     except LaeError as error:
         raise LaeError(

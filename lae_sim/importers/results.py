@@ -345,7 +345,7 @@ def _npz_boxes(path: Path, name: str) -> Floats:
             within_budget(path, math.prod(shape) * (kind.itemsize + np.dtype(np.float64).itemsize))
             with archive.open(member) as file:
                 boxes = np.lib.format.read_array(file, allow_pickle=False)
-    except LaeError:
+    except (LaeError, MemoryError):
         raise
     except Exception as error:  # a damaged file can raise anything
         raise LaeError(f"{path}: array {name[:80]!r} cannot be read: {error}") from error
