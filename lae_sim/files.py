@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import tempfile
@@ -94,9 +95,10 @@ class Budget:
         """
         self.left -= size
         if self.left < 0:
+            most = _MAX_DECODED.get() / 2**20
             raise self._error(
-                f"{self._path}: would take more than {_MAX_DECODED.get() / 2**20:,.4g} MiB of "
-                "memory, too much for such a file; if it is right, --max-decoded 1GiB allows more"
+                f"{self._path}: would take more than {most:,.4g} MiB of memory, too much for such a "
+                f"file; if it is right, --max-decoded {math.ceil(4 * most)}MiB allows more"
             )
 
 
