@@ -97,8 +97,8 @@ class Budget:
         if self.left < 0:
             most = _MAX_DECODED.get() / 2**20
             raise self._error(
-                f"{self._path}: would take more than {most:,.4g} MiB of memory, too much for such a "
-                f"file; if it is right, --max-decoded {math.ceil(4 * most)}MiB allows more"
+                f"{self._path}: would take more than {most:,.4g} MiB of memory, too much for such "
+                f"a file; if it is right, --max-decoded {math.ceil(4 * most)}MiB allows more"
             )
 
 
