@@ -22,6 +22,7 @@ Result = TypeVar("Result")
 MAX_DECODED = "256MiB"
 """What a file may take in memory, once it is decoded, unless :func:`max_decoded` says otherwise."""
 
+_JSON_VALUE_BYTES = 80  # an empty list or dict, and its place in another
 _UNITS = {"": 0, "K": 10, "M": 20, "G": 30, "T": 40}
 _SIZE = re.compile(r"([0-9]{1,15}) ?([KMGT]?)(?:i?B)?\Z")
 # As numpy.errstate: a setting of whoever calls, not of the process.
@@ -109,6 +110,11 @@ def within_budget(path: str | os.PathLike[str], size: int) -> None:
         TooLargeError: if it is too much.
     """
     Budget(path).take(size)
+
+
+def json_memory(text: bytes) -> int:
+    """What the values of a JSON document take at most in memory, bytes, before they are decoded."""
+    return 2 * len(text) + _JSON_VALUE_BYTES * sum(map(text.count, (b",", b":", b"[", b"{")))
 
 
 def allowing(work: Callable[[Item], Result]) -> Callable[[Item], Result]:

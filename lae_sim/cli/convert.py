@@ -18,16 +18,19 @@ from lae_sim.progress import ProgressBar
 if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary
 
-_FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "npz", "lae-pvt")
+_FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "json", "npz", "lae-pvt")
 _EXAMPLES = """\
 formats (auto tells them apart):
   got10k       <seq>.txt with <seq>_time.txt or times/<seq>_time.txt (s);
                <seq>/<seq>_001.txt with <seq>/<seq>_time.txt
   pytracking   <seq>.txt with <seq>_time.txt (s), separated by tabs
   ope          <seq>.txt (comma, tab or space), no times: needs --time
-  mat          <seq>.mat or <seq>_<tracker>.mat with res and fps (OTB, UAV123 benchmarks)
+  mat          <seq>.mat with res and fps, boxes or another motion model (OTB, UAV123 benchmarks)
+  json         <seq>.json with res and fps (jwlim's tracker_benchmark)
   npz          one file, an array [frames, 4] per sequence: needs --time
   lae-pvt      <seq>.pkl of LAE-PVT and PVT++, recorded in real time
+Names may be <dataset>_<seq> (nfs_, uav_, ...), <seq>_<tracker> and <tracker>_<seq> in any format;
+of several trackers in a folder --tracker chooses one. A .mat of version 7.3 needs lae-sim[mat73].
 
 examples:
   lae-sim convert results/kcf --truth OTB100 --out kcf.parquet
@@ -35,6 +38,7 @@ examples:
   lae-sim convert results/ECO --truth UAV123_10fps --fps 10 --time mean-fps:13.5 --out eco.parquet
   lae-sim convert results_rt_raw/siamrpn --truth UAVDT --device 'AGX Xavier' --out rt.parquet
   lae-sim convert results/kcf --truth OTB100 --truth-file Tiger1=Tiger1_354.txt --out kcf.parquet
+  lae-sim convert results/OPE_OTB --tracker ECO-HC --truth OTB100 --out eco-hc.parquet
 """
 
 
@@ -58,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--fps",
         help="world frames per second, such as 29.97 or 30000/1001 (default: 30, or 10 if the "
-        "dataset's name says 10fps)",
+        "dataset's name says 10fps); of NfS, the set: 30 or 240",
     )
     add(
         "--time",
@@ -74,7 +78,11 @@ def _parser() -> argparse.ArgumentParser:
         "since the start (default: s, where the median is then from 0.5 to 250 ms)",
     )
     add("--repetition", type=int, default=1, metavar="K", help="take the K-th run (default: 1)")
-    add("--tracker", metavar="NAME", help="the tracker's name (default: that of RESULTS)")
+    add(
+        "--tracker",
+        metavar="NAME",
+        help="the tracker's name (default: that of RESULTS), or which of several in one folder",
+    )
     add("--device", metavar="TEXT", help="the device that the times were taken on")
     add("--dataset", metavar="NAME", help="the dataset's name (default: that of its folder)")
     add("--sequence", nargs="+", default=[], metavar="NAME", help="only these sequences")
@@ -152,16 +160,25 @@ def _text(summary: ConversionSummary, out: Path) -> str:
         lines.append(f"Times read as {summary.times_read_as}.")
     if "note" in summary.timing:
         lines.append(f"Note: {summary.timing['note']}.")
+    if summary.held:
+        lines.append(
+            f"The tracker had no box in {sum(summary.held.values()):,} frames of "
+            f"{len(summary.held)} sequences ({listed(list(summary.held))}); there its last one "
+            "stands."
+        )
     if summary.row_0_from_truth:
         lines.append(
             f"Row 0 is not the initial box in {len(summary.row_0_from_truth)} of "
             f"{summary.sequences} sequences ({listed(summary.row_0_from_truth)}); there the trace "
             "starts from the truth, as the tracker did."
         )
+    if summary.other_trackers:
+        lines.append(f"Left out, of other trackers: {listed(summary.other_trackers)}.")
     if summary.without_truth:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:
         lines.append(f"Without results: {listed(summary.without_results)}.")
+    lines += [f"Note: {note}." for note in summary.notes]
     return "\n".join([*lines, f"Next: lae-sim replay {out}"])
 
 

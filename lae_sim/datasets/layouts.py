@@ -20,6 +20,7 @@ import numpy as np
 from lae_sim._arrays import Floats
 from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
+from lae_sim.datasets.names import SequenceNames
 from lae_sim.datasets.synthetic import synthetic_dataset
 from lae_sim.engine.clock import Number, parse_fps
 from lae_sim.errors import LaeError, shown
@@ -35,6 +36,7 @@ _BESIDE_ANNOTATIONS = (
     "data_seq/UAV123/{}",
     "data_seq/UAV123_10fps/{}",
     "data_seq/{}",
+    "frames/{}",
     "{}/img",
     "{}",
 )
@@ -72,7 +74,7 @@ def find_dataset(
         sequences: names of those wanted; all by default.
         box: the first box ``x, y, w, h`` in pixels, for images or a video without ground truth.
         fps: frames per second; by default the dataset's (30, or 10 for UAV123_10fps and GOT-10k)
-            or the video's own.
+            or the video's own. Of NfS it chooses the set, of 30 or 240.
 
     Returns:
         The dataset. Where only the first box is known, the truth after it is NaN.
@@ -106,16 +108,18 @@ def find_dataset(
     if root.is_file() or box is not None:
         return _without_truth(name, root, sequences, box, fps)
     name = _SPELLINGS.get((name or "").lower(), name)
-    truth = find_truth(root / "anno" / name if name and (root / "anno" / name).is_dir() else root)
+    named = root / "anno" / name if name else root
+    truth = find_truth(named if named.is_dir() else root, fps)
     if name is None:
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
     chosen_sequences = [
-        _sequence(root, sequence, truth.files[sequence], attributes.get(sequence, ()))
-        for sequence in _choose(sequences, truth.files, str(root), truth.match)
+        _sequence(root, sequence, truth.files[sequence], attributes.of.get(sequence, ()))
+        for sequence in _choose(sequences, truth.files, str(root))
     ]
-    return Dataset(name, fps or Fraction(_FPS.get(name, 30)), chosen_sequences)
+    fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
+    return Dataset(name, fps, chosen_sequences, attributes.notes)
 
 
 def _without_truth(
@@ -148,8 +152,8 @@ def _without_truth(
 
 
 def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) -> ImageSequence:
-    truth = read_truth(file)
     paths, first = _find_images(root, name, file)
+    truth = read_truth(file, len(paths))
     if len(truth) == 1:
         truth = _only_first(truth, len(paths))
     if len(paths) > len(truth):
@@ -234,21 +238,17 @@ def _only_first(first: Floats, length: int) -> Floats:
     return truth
 
 
-def _choose(
-    wanted: Sequence[str] | None,
-    available: Iterable[str],
-    where: str,
-    match: Callable[[str], str | None] = lambda name: None,
-) -> list[str]:
+def _choose(wanted: Sequence[str] | None, available: Iterable[str], where: str) -> list[str]:
     """The wanted names of those available, in their order; all of them if none is named."""
     names = list(available)
+    known = SequenceNames(names)
     chosen = set()
     for name in wanted or ():
-        matching = name if name in names else match(name)
-        if matching is None:
+        meant = known.meant(name)
+        if len(meant) != 1:
             close = difflib.get_close_matches(name, names) or names[:3]
             raise LaeError(
                 f"{where}: no sequence {name!r} among {len(names)}; there is {', '.join(close)}"
             )
-        chosen.add(matching)
+        chosen.update(meant)
     return [name for name in names if not wanted or name in chosen]

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lae_sim._arrays import Ints
+from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
+from lae_sim.datasets.names import Reading, SequenceNames
 from lae_sim.engine.clock import Clock, Number, parse_fps
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, hint, shown
 from lae_sim.importers.coordinates import other_reading, row_0_is_off
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.importers.results import (
@@ -25,7 +26,6 @@ from lae_sim.importers.results import (
     frame_ns,
     given_times,
     read_results,
-    tracker_name,
 )
 from lae_sim.importers.times import (
     MeasuredTimes,
@@ -43,6 +43,8 @@ from lae_sim.trace.recording import Recording
 Progress = Callable[[int, int], object]
 """``progress(done, total)`` is called after each sequence."""
 
+_VOT_EXPERIMENTS = ("baseline", "longterm", "realtime", "supervised", "unsupervised")
+
 
 @dataclass(frozen=True)
 class ConversionSummary:
@@ -57,10 +59,13 @@ class ConversionSummary:
         sequences, frames, processed: how many; a frame is processed where it has a time.
         median_ms: median time of a processed frame, ms.
         times_read_as: the unit of measured times, in words; None where none were read.
+        held: frames of each sequence in which the tracker had no box, and its last one stands.
         row_0_from_truth: sequences whose row 0 was more than 3 px off the initial box, from which
             the tracker started; in the trace it is that box.
+        other_trackers: trackers whose results lie there too, and were left out.
         without_truth: results that were left out, since they have no ground truth.
         without_results: sequences of the ground truth that have no results.
+        notes: what else could not be read, and was left out.
         files: what was read.
     """
 
@@ -75,9 +80,12 @@ class ConversionSummary:
     processed: int
     median_ms: float
     times_read_as: str | None
+    held: Mapping[str, int]
     row_0_from_truth: list[str]
+    other_trackers: list[str]
     without_truth: list[str]
     without_results: list[str]
+    notes: list[str]
     files: list[Path]
 
     def document(self, path: str | Path) -> dict[str, Any]:
@@ -113,13 +121,14 @@ def convert_results(
         truth: the dataset's folder (see :mod:`lae_sim.datasets.annotations`).
         format: a name of :data:`lae_sim.importers.results.FORMATS`, or ``"auto"``.
         fps: world frames per second, such as ``30`` or ``"30000/1001"``; by default 30, or 10 if
-            the dataset's name says ``10fps``.
+            the dataset's name says ``10fps``. Of NfS it chooses the set, of 30 or 240.
         time: where times come from (see :func:`lae_sim.importers.results.given_times`).
         time_unit: of measured times: ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, or ``"fps"`` for rates;
             ``"cumulative-s"`` and so on for times since the start. By default seconds, if no header
             says otherwise and their median is from 0.5 to 250 ms.
         repetition: which run to take where the toolkit repeats them, from 1.
-        tracker: its name; by default that of the results.
+        tracker: its name; by default that of the results. Where results of several trackers lie
+            together, as ``<seq>_<tracker>``, it says which to take.
         device: what the times were taken on.
         dataset: its name; by default that of its folder.
         sequences: names to keep; all by default.
@@ -160,8 +169,10 @@ def convert_results(
     results = Path(results)
     kind, sources = find_results(results, format, repetition)
     other = {name: Path(path) for name, path in (truth_files or {}).items()}
-    annotations = find_truth(Path(truth)).with_files(other)
-    known, without_truth = _with_truth(kind, sources, annotations, skip_missing)
+    asked = None if fps is None else parse_fps(fps)
+    annotations = find_truth(Path(truth), asked).with_files(other)
+    found = _with_truth(results, sources, annotations, tracker, skip_missing)
+    known = found.sources
     absent = sorted({*sequences, *exclude, *other} - set(known))
     if absent:
         raise LaeError(f"{results}: no results of sequence {listed(absent)}")
@@ -169,9 +180,9 @@ def convert_results(
     if not matched:
         raise LaeError("--exclude leaves no sequence")
     dataset = dataset or annotations.dataset
-    rate = str(fps or ("10" if "10fps" in dataset.lower() else 30))
+    rate = str(fps or annotations.fps or ("10" if "10fps" in dataset.lower() else 30))
     clock = Clock.at(parse_fps(rate))
-    tracker = tracker or tracker_name(kind, results, matched)
+    tracker = tracker or found.tracker or _folder_name(kind, results)
     given = given_times(time, tracker)
     schedule: dict[str, Any] = {"kind": "every-frame"}
     if kind == "lae-pvt":
@@ -180,28 +191,26 @@ def convert_results(
                 "--time and --time-unit do not go with lae-pvt: its runs hold times in s"
             )
         schedule = {"kind": "real-time", "schedule": {"policy": "latest"}}
-        recordings, timing = _real_time(matched, annotations, clock, progress)
-        times_read_as: str | None = "seconds since the start"
+        converted = _real_time(matched, annotations, clock, progress)
     else:
 
         def read(source: Source) -> Results:
             return read_results(kind, source, repetition, time_unit, measured=given is None)
 
-        recordings, timing, times_read_as = _every_frame(
-            matched, annotations, read, given, progress
-        )
-        if time_unit and times_read_as is None:
+        converted = _every_frame(matched, annotations, read, given, progress)
+        if time_unit and converted.times_read_as is None:
             raise LaeError("--time-unit is that of measured times, and none are read here")
-    as_published = recordings
+    as_published = converted.recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
+    attributes = read_attributes(annotations)
     metadata = Metadata.new(
         rate,
         **schedule,
         tracker={"name": tracker},
         device={"model": device} if device else {},
         dataset={"name": dataset},
-        timing=timing,
-        sequences=_sequence_entries(matched, read_attributes(annotations), image_size),
+        timing=converted.timing,
+        sequences=_sequence_entries(matched, attributes.of, image_size),
     )
     left_out = {*matched, *exclude}
     elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
@@ -211,15 +220,18 @@ def convert_results(
         fps=rate,
         tracker=tracker,
         dataset=dataset,
-        timing=timing,
+        timing=converted.timing,
         sequences=len(recordings),
         frames=len(elapsed),
         processed=int((elapsed >= 0).sum()),
         median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
-        times_read_as=times_read_as,
+        times_read_as=converted.times_read_as,
+        held=converted.held,
         row_0_from_truth=[new.name for new, old in zip(recordings, as_published) if new is not old],
-        without_truth=without_truth,
+        other_trackers=found.others,
+        without_truth=found.without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
+        notes=list(attributes.notes),
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
             *annotations.files.values(),
@@ -229,30 +241,104 @@ def convert_results(
     return Trace(metadata, recordings), summary
 
 
+@dataclass(frozen=True)
+class _Matched:
+    """Results and the sequences of the ground truth that they are of.
+
+    Attributes:
+        sources: by sequence.
+        tracker: whose they are, if their names say it.
+        without_truth: names of the tracker's results of no known sequence.
+        others: the other trackers whose results lie there.
+    """
+
+    sources: Mapping[str, Source]
+    tracker: str | None
+    without_truth: list[str]
+    others: list[str]
+
+
 def _with_truth(
-    kind: str, sources: Sequence[Source], truth: GroundTruth, skip_missing: bool
-) -> tuple[dict[str, Source], list[str]]:
-    """The results of each sequence of the ground truth, and the names of those without one."""
-    matched: dict[str, Source] = {}
-    missing = []
+    path: Path, sources: Sequence[Source], truth: GroundTruth, tracker: str | None, skip: bool
+) -> _Matched:
+    """Match results of one tracker, the one that is asked for where there are several."""
+    names = SequenceNames(truth.files)
     only_truth = next(iter(truth.files)) if truth.root.is_file() and len(sources) == 1 else None
+    by_tracker: dict[str | None, list[tuple[str, Source]]] = {}
+    missing = []
     for source in sources:
-        name = truth.match(source.name, with_tracker=kind == "mat") or only_truth
-        if name is None:
+        try:
+            reading = names.read(source.name, tracker)
+        except LaeError as error:
+            raise LaeError(f"{source.path}: {error}") from error
+        if reading is None and only_truth:
+            reading = Reading(only_truth)
+        if reading is None:
             missing.append(source.name)
-        elif name in matched:
+        else:
+            by_tracker.setdefault(reading.tracker, []).append((reading.sequence, source))
+    chosen, others = _one_tracker(path, by_tracker, tracker)
+    if others:
+        missing = [name for name in missing if chosen in (name.split("_", 1)[0], *_tails(name))]
+    matched: dict[str, Source] = {}
+    for name, source in by_tracker.get(chosen, []):
+        if name in matched:
             raise LaeError(
                 f"{source.path} and {matched[name].path} are both results of sequence {name!r}; "
                 "give the folder or file of one tracker"
             )
-        else:
-            matched[name] = source
-    if not matched or (missing and not skip_missing):
+        matched[name] = source
+    if not matched or (missing and not skip):
         raise LaeError(
             f"{truth.root}: no ground truth for {listed(missing)}, of {len(sources)} results"
             + ("; --skip-missing leaves them out" if matched else "; is it the right dataset?")
         )
-    return matched, missing
+    return _Matched(matched, chosen, missing, others)
+
+
+def _tails(name: str) -> list[str]:
+    """What stands behind each underscore."""
+    return [name[at + 1 :] for at, character in enumerate(name) if character == "_"]
+
+
+def _one_tracker(
+    path: Path, by_tracker: Mapping[str | None, list[tuple[str, Source]]], wanted: str | None
+) -> tuple[str | None, list[str]]:
+    """The tracker whose results are taken, and the others that lie there.
+
+    Raises:
+        LaeError: if there are several, and none of them is the one that is wanted.
+    """
+    if len(by_tracker) < 2:
+        return next(iter(by_tracker), None), []
+    known = sorted(tracker for tracker in by_tracker if tracker)
+    if wanted and wanted in by_tracker:
+        return wanted, [tracker for tracker in known if tracker != wanted]
+    found = f"results of {len(known)} trackers ({listed(known, 20)})"
+    if None in by_tracker:
+        plain = [source.path.name for _, source in by_tracker[None]]
+        found += f" and files that name none ({listed(plain, 3)})"
+    raise LaeError(
+        f"{path}: holds {found}; "
+        + (f"none is {wanted!r}{hint(wanted, known)}" if wanted else "choose one with --tracker")
+    )
+
+
+@dataclass(frozen=True)
+class _Converted:
+    """Results as recordings.
+
+    Attributes:
+        recordings: of the matched sequences.
+        timing: what the trace says of their times.
+        times_read_as: what measured times were read as, in words.
+        held: frames of each sequence in which the tracker had no box.
+    """
+
+    recordings: list[Recording]
+    timing: dict[str, str]
+    times_read_as: str | None = None
+    held: Mapping[str, int] = field(default_factory=dict)
 
 
 def _every_frame(
@@ -261,16 +347,14 @@ def _every_frame(
     read: Callable[[Source], Results],
     given: GivenTimes | None,
     progress: Progress,
-) -> tuple[list[Recording], dict[str, str], str | None]:
-    """The recordings of results on every frame, and what the trace says of their times.
-
-    Last comes what measured times were read as (see :func:`lae_sim.importers.times.understood`).
-    """
+) -> _Converted:
+    """The recordings of results on every frame."""
     recordings = []
+    held = {}
     times: list[MeasuredTimes] = []
     for name, source in matched.items():
         results = read(source)
-        boxes = read_truth(truth.files[name])
+        boxes = read_truth(truth.files[name], len(results.boxes))
         elapsed = _elapsed(name, source, results, given)
         if len(results.boxes) != len(boxes):
             raise LaeError(
@@ -281,18 +365,51 @@ def _every_frame(
         if not given and results.elapsed_ns is not None:
             path = source.times or source.path
             times.append(MeasuredTimes(name, path, elapsed, results.unit))
-        recordings.append(Recording.new(name, boxes, results.boxes, elapsed))
+        try:
+            answers, count = _held(results.boxes, boxes)
+        except LaeError as error:
+            raise LaeError(f"{source.path}: {error}") from error
+        if count:
+            held[name] = count
+        recordings.append(Recording.new(name, boxes, answers, elapsed))
         _check(recordings[-1], source.path, truth.files[name])
         progress(len(recordings), len(matched))
     if given:
-        return recordings, {"source": given.source}, None
+        return _Converted(recordings, {"source": given.source}, held=held)
     check_seconds(times)
     timing = {"source": "mean fps of each sequence from the results, not measured per frame"}
     if len(times) == len(matched):
         timing = {"source": "measured"}
     if note := ascending_note(times):
         timing["note"] = note
-    return recordings, timing, understood(times) or None
+    return _Converted(recordings, timing, understood(times) or None, held)
+
+
+def _held(boxes: Floats, truth: Floats) -> tuple[Floats, int]:
+    """The boxes with the last one in place of none, as the OTB toolkit has it.
+
+    In row 0 that is the initial box.
+
+    Args:
+        boxes: of the tracker, float64 [n, 4]; NaN = it has none.
+        truth: ground truth, float64 [n, 4].
+
+    Returns:
+        The boxes, and in how many frames after the first there was none.
+
+    Raises:
+        LaeError: if neither has a box in row 0.
+    """
+    lost = np.isnan(boxes[:, 0])
+    if not lost.any():
+        return boxes, 0
+    if lost[0]:
+        if np.isnan(truth[0]).any():
+            raise LaeError("row 1 has no box, and neither has the ground truth")
+        boxes = np.concatenate([truth[:1], boxes[1:]])
+        lost[0] = False
+    last = np.maximum.accumulate(np.where(lost, 0, np.arange(len(boxes))))
+    return boxes[last], int(lost.sum())
 
 
 def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | None) -> Ints:
@@ -320,8 +437,8 @@ def _elapsed(name: str, source: Source, results: Results, given: GivenTimes | No
 
 def _real_time(
     matched: Mapping[str, Source], truth: GroundTruth, clock: Clock, progress: Progress
-) -> tuple[list[Recording], dict[str, str]]:
-    """The recordings of released real-time runs, and what the trace says of their times."""
+) -> _Converted:
+    """The recordings of released real-time runs."""
     runs = []
     for name, source in matched.items():
         runs.append(read_run(source.path, name, read_truth(truth.files[name]), clock))
@@ -341,7 +458,9 @@ def _real_time(
             f"the time of the initialisation is not recorded in {unknown} of {len(runs)} sequences"
         )
     note = {"note": "; ".join(notes)} if notes else {}
-    return [run.recording for run in runs], {"source": "measured", **note}
+    return _Converted(
+        [run.recording for run in runs], {"source": "measured", **note}, "seconds since the start"
+    )
 
 
 def _check(recording: Recording, results: Path, truth: Path) -> None:
@@ -387,6 +506,14 @@ def _sequence_entries(
         }
         entries[name] = {key: value for key, value in entry.items() if value}
     return entries
+
+
+def _folder_name(kind: str, path: Path) -> str:
+    """The tracker's name where only its file of all sequences or its folder has it."""
+    if kind == "npz":
+        return path.stem
+    folder = path.resolve().parent if path.is_file() else path.resolve()
+    return folder.parent.name if folder.name in _VOT_EXPERIMENTS else folder.name
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

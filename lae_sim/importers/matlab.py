@@ -1,7 +1,8 @@
-"""MATLAB files of version 5 to 7: numbers, text, cells and structs.
+"""MATLAB files: numbers, text, cells and structs.
 
-Written out here because ``scipy.io.loadmat`` crashes the process on damaged files. See MathWorks,
-"MAT-File Format": a file is a header and data elements, each with a tag of its type and size.
+Those of version 5 to 7 are read here, since ``scipy.io.loadmat`` crashes the process on damaged
+files. See MathWorks, "MAT-File Format": a file is a header and data elements, each with a tag of
+its type and size.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 
 from lae_sim.errors import LaeError
 from lae_sim.files import Budget
+from lae_sim.importers.hdf5 import load_hdf5
 
 _MAX_DEPTH = 16
 # What an array, a cell or a field takes as an object of Python, generously.
@@ -54,7 +56,7 @@ def load_matlab(path: Path) -> dict[str, Any]:
 
     Raises:
         LaeError: if the file is of another version, damaged, or larger than any result (see
-            :func:`lae_sim.files.max_decoded`).
+            :func:`lae_sim.files.max_decoded`), or it is of version 7.3 and h5py is not installed.
     """
     budget = Budget(path)
     try:
@@ -64,10 +66,10 @@ def load_matlab(path: Path) -> dict[str, Any]:
         raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
     head = bytes(data[:_HEADER_BYTES])
     if head.startswith((b"MATLAB 7.3", b"\x89HDF")):
-        raise LaeError(f"{path}: a version 7.3 file; save it in MATLAB with save(..., '-v7')")
+        return load_hdf5(path)
     order = {b"IM": "<", b"MI": ">"}.get(head[126:])
     if not head.startswith(b"MATLAB 5.0") or order is None:
-        raise LaeError(f"{path}: not a MATLAB file of version 5 to 7")
+        raise LaeError(f"{path}: not a MATLAB file of version 5 to 7.3")
     try:
         return _variables(data, order, budget)
     except (ValueError, OverflowError, struct.error, zlib.error, UnicodeError) as error:

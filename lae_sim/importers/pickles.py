@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from lae_sim.datasets.foreign import told_apart
 from lae_sim.errors import LaeError
 from lae_sim.files import Budget, TooLargeError
 
@@ -93,23 +94,26 @@ def load_plain(path: Path) -> Any:
         LaeError: if the file asks for anything else, which it names, or is damaged.
     """
     budget = Budget(path)
-    try:
-        budget.take(path.stat().st_size)
-        data = path.read_bytes()
-        _check_operations(data, budget)
-        # Python 2 keeps bytes and text alike; latin1 keeps every byte.
-        return _Decoder().decode(_Unpickler(io.BytesIO(data), encoding="latin1").load())
-    except (TooLargeError, MemoryError):
-        raise
-    except LaeError as error:
-        raise LaeError(
-            f"{path}: {error}: a pickle of results may hold numbers, text, lists, dicts and "
-            "numeric NumPy arrays only"
-        ) from error
-    except FileNotFoundError as error:
-        raise LaeError(f"{path}: no such file") from error
-    except Exception as error:  # a hostile pickle can raise anything
-        raise LaeError(f"{path}: not a readable pickle: {ascii(str(error))[1:-1][:200]}") from error
+    with told_apart(path, b"\x80"):
+        try:
+            budget.take(path.stat().st_size)
+            data = path.read_bytes()
+            _check_operations(data, budget)
+            # Python 2 keeps bytes and text alike; latin1 keeps every byte.
+            return _Decoder().decode(_Unpickler(io.BytesIO(data), encoding="latin1").load())
+        except (TooLargeError, MemoryError):
+            raise
+        except LaeError as error:
+            raise LaeError(
+                f"{path}: {error}: a pickle of results may hold numbers, text, lists, dicts and "
+                "numeric NumPy arrays only"
+            ) from error
+        except FileNotFoundError as error:
+            raise LaeError(f"{path}: no such file") from error
+        except Exception as error:  # a hostile pickle can raise anything
+            raise LaeError(
+                f"{path}: not a readable pickle: {ascii(str(error))[1:-1][:200]}"
+            ) from error
 
 
 def _check_operations(data: bytes, budget: Budget) -> None:

@@ -1,4 +1,4 @@
-"""Results of other toolkits on every frame: GOT-10k toolkit, pytracking, OPE text, MATLAB, npz.
+"""Results of other toolkits on every frame: text, MATLAB, JSON, npz.
 
 Each reader gives the boxes and, where the files have them, the times. Real-time runs are read by
 :mod:`lae_sim.importers.lae_pvt`.
@@ -11,6 +11,7 @@ import io
 import math
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -20,20 +21,31 @@ from zipfile import ZipFile
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.numbers import read_numbers, read_text
+from lae_sim.datasets.foreign import HEAD_BYTES, Foreign, foreign, foreign_columns, told_apart
+from lae_sim.datasets.numbers import read_lines, read_numbers, read_text
 from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
 from lae_sim.errors import LaeError
 from lae_sim.files import Budget, within_budget
 from lae_sim.importers.matlab import load_matlab
+from lae_sim.importers.otb import load_json, read_run
 from lae_sim.importers.times import read_times
 
-FORMATS = ("got10k", "pytracking", "ope", "mat", "npz", "lae-pvt")
+FORMATS = ("got10k", "pytracking", "ope", "mat", "json", "npz", "lae-pvt")
 
 NO_TIMES = "give --time constant:47ms, --time mean-fps:120 or --time mean-fps:FILE.csv"
 
-_SUFFIXES = {".npz": "npz", ".mat": "mat", ".pkl": "lae-pvt", ".pickle": "lae-pvt"}
+_SUFFIXES = {
+    ".json": "json",
+    ".mat": "mat",
+    ".npz": "npz",
+    ".pickle": "lae-pvt",
+    ".pkl": "lae-pvt",
+}
 # What toolkits write beside the boxes.
 _NOT_BOXES = ("_time", "_all_boxes", "_all_scores", "_scores", "_confidence", "_conf")
+# What the VOT toolkit writes in place of a region: nothing known, the tracker starts, it failed.
+_VOT_UNKNOWN, _VOT_START, _VOT_FAILED = "0", "1", "2"
+_SIGNED_NAN = re.compile(r"[-+]?\bnan\b(?:\(ind\))?", re.IGNORECASE)  # C's printf
 
 
 @dataclass(frozen=True)
@@ -56,7 +68,7 @@ class Results:
     """What a tracker did on every frame of one sequence.
 
     Attributes:
-        boxes: ``x, y, w, h`` in pixels, float64 [n, 4].
+        boxes: ``x, y, w, h`` in pixels, float64 [n, 4]; a row of NaN = the tracker has none.
         elapsed_ns: measured times in ns, int64 [n], if there are any.
         mean_fps: mean frames per second, where the file says only that.
         unit: of measured times, if it was said (see :func:`lae_sim.importers.times.read_times`).
@@ -162,14 +174,16 @@ def find_results(path: Path, wanted: str = "auto", repetition: int = 1) -> tuple
     if not path.exists():
         raise LaeError(f"{path}: no such file or folder of results")
     by_format = _by_format(path, repetition)
-    if wanted != "auto":
+    if wanted == "auto" and len(by_format) > 1:
+        by_format.pop("json", None)  # settings or a summary beside results
+    elif wanted != "auto":
         kind = "text" if wanted in ("got10k", "pytracking", "ope") else wanted
         by_format = {kind: by_format[kind]} if kind in by_format else {}
     if not by_format:
         raise LaeError(
             f"{path}: no results found{'' if wanted == 'auto' else f' of format {wanted}'}; looked "
-            "for <seq>.txt, <seq>/<seq>_001.txt, .mat, .npz and .pkl files; give the folder of "
-            "one tracker"
+            "for <seq>.txt, <seq>/<seq>_001.txt, .mat, .json, .npz and .pkl files"
+            f"{_found_instead(path)}"
         )
     if len(by_format) > 1:
         raise LaeError(f"{path}: holds {' and '.join(by_format)} results; say which with --format")
@@ -194,62 +208,50 @@ def read_results(
     Raises:
         LaeError: if a file is damaged or is not of the format.
     """
-    if kind == "mat":
-        return read_mat(source.path)
+    if kind in ("mat", "json"):
+        return _read_otb(source.path)
     if kind == "npz":
         return Results(_npz_boxes(source.path, source.name))
-    boxes = _checked_boxes(read_numbers(source.path), str(source.path))
+    boxes = _text_boxes(source.path)
     if source.times is None or not measured or kind == "ope":
         return Results(boxes)
     elapsed_ns, stated = read_times(source.times, unit, repetition - 1)
     return Results(boxes, elapsed_ns, unit=stated)
 
 
-def read_mat(path: Path) -> Results:
-    """Read a MATLAB result: ``res`` [n, 4] and ``fps``, alone or in ``results`` as OTB has them.
+def _read_otb(path: Path) -> Results:
+    """Read ``res`` and ``fps``, alone or in ``results`` as the OTB toolkit has them."""
+    with told_apart(path, b"MATLAB", b"\x89HDF"):
+        content = load_json(path) if path.suffix.lower() == ".json" else load_matlab(path)
+        run = read_run(content, str(path))
+    return Results(_checked_boxes(run.boxes, str(path)), mean_fps=run.mean_fps)
+
+
+def _text_boxes(path: Path) -> Floats:
+    """Boxes of a text file; NaN where it says that the tracker has none.
 
     Raises:
-        LaeError: if the file is not of version 5 to 7, or lacks a field.
+        LaeError: if they are no boxes, or those of a tracker that was started again.
     """
-    content = load_matlab(path)
-    run = content.get("results", content)
-    if isinstance(run, list):
-        if len(run) != 1:
-            raise LaeError(f"{path}: holds {len(run)} runs (SRE or TRE?), and one pass is needed")
-        run = run[0]
-    if not isinstance(run, Mapping) or "res" not in run:
-        raise LaeError(f"{path}: no field 'res' (boxes x, y, w, h)")
-    if run.get("type", "rect") != "rect":
-        raise LaeError(f"{path}: boxes of type {str(run['type'])[:40]!r}; only 'rect' is known")
-    boxes = _checked_boxes(run["res"], str(path))
-    stated, fps = _scalar(run.get("len")), _scalar(run.get("fps"))
-    if stated not in (None, len(boxes)):
-        raise LaeError(f"{path}: field 'len' is {stated:g}, and 'res' has {len(boxes)} rows")
-    if fps is not None and math.isfinite(fps) and fps > 0:
-        return Results(boxes, mean_fps=Fraction(fps))
-    return Results(boxes)
-
-
-def tracker_name(kind: str, path: Path, matched: Mapping[str, Source]) -> str:
-    """The tracker's name as its results tell it.
-
-    Args:
-        kind: a name of ``FORMATS``.
-        path: of the results.
-        matched: the source of each sequence.
-    """
-    if kind == "npz":
-        return path.stem
-    if kind == "mat":  # <seq>_<tracker>.mat
-        tails = {source.name[len(name) :].strip("_") for name, source in matched.items()}
-        if len(tails) == 1 and tails != {""}:
-            return tails.pop()
-    folder = path.resolve()
-    return folder.parent.name if folder.is_file() else folder.name
-
-
-def _scalar(value: Any) -> float | None:
-    return float(value.item()) if isinstance(value, np.ndarray) and value.size == 1 else None
+    lines = [_SIGNED_NAN.sub("nan", line) for line in read_lines(path)]
+    if _VOT_FAILED in lines or lines.count(_VOT_START) > 1:
+        raise LaeError(
+            f"{path}: VOT's supervised results (1 = start, 2 = failure): restarted runs cannot be "
+            "replayed; use those of its unsupervised, longterm or realtime experiment"
+        )
+    if lines[0] == _VOT_START:
+        lines[0] = _VOT_UNKNOWN
+    first = next((line for line in lines if line != _VOT_UNKNOWN), "")
+    other = foreign(first.encode())
+    if other is not None:
+        raise LaeError(f"{path}: {other}")
+    table = read_numbers(path, nan=True, absent=True, lines=lines)
+    other = foreign_columns(table) if table.shape[1] != 4 else None
+    if other is None and table.shape[1] == 8:
+        other = Foreign("polygons of four corners", "write x,y,w,h of the box around each")
+    if other is not None:
+        raise LaeError(f"{path}: {other}")
+    return _checked_boxes(table, str(path))
 
 
 def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | None, int]]]:
@@ -301,6 +303,24 @@ def _by_format(path: Path, repetition: int) -> dict[str, list[Source]]:
     return by_format
 
 
+def _found_instead(path: Path) -> str:
+    """What there is in place of results, to end a message with."""
+    if path.is_dir():
+        for folder in sorted(path.iterdir()):
+            with suppress(LaeError, OSError):
+                if folder.is_dir() and _by_format(folder, 1):
+                    return f"; give the folder of one tracker, such as {folder}"
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    for file in [file for file in files if file.is_file()][:5]:
+        with suppress(OSError), file.open("rb") as opened:
+            other = foreign(opened.read(HEAD_BYTES))
+            if other is not None:
+                return f"; {file.name} {other}"
+            if file.suffix.lower() in (".csv", ".tsv", ".dat", ""):
+                return f"; is {file.name} a table? Name it <seq>.txt, a line x,y,w,h for each frame"
+    return "; give the folder of one tracker"
+
+
 def _first_file(*paths: Path) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
@@ -319,18 +339,25 @@ def _checked_boxes(boxes: Any, where: str) -> Floats:
     if boxes.shape[1] != 4:
         raise LaeError(f"{where}: {boxes.shape[1]} columns; boxes have 4: x, y, w, h")
     table = boxes.astype(np.float64, copy=False)
-    bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
+    lost = np.isnan(table).all(axis=1)
+    bad = np.flatnonzero(~np.isfinite(table).all(axis=1) & ~lost)
     if len(bad):
-        raise LaeError(f"{where}: the box in row {bad[0] + 1} is not finite; every frame needs one")
+        raise LaeError(
+            f"{where}: the box in row {bad[0] + 1} is not finite; where the tracker has none, "
+            "write NaN in all four columns"
+        )
+    if lost.all():
+        raise LaeError(f"{where}: holds no box at all")
     return table
 
 
 def _npz_names(path: Path) -> list[str]:
-    try:
-        with ZipFile(path) as archive:
-            entries = archive.infolist()
-    except Exception as error:  # a damaged file can raise anything
-        raise LaeError(f"{path}: not a readable .npz file: {error}") from error
+    with told_apart(path, b"PK"):
+        try:
+            with ZipFile(path) as archive:
+                entries = archive.infolist()
+        except Exception as error:  # a damaged file can raise anything
+            raise LaeError(f"{path}: not a readable .npz file: {error}") from error
     within_budget(path, sum(entry.file_size for entry in entries))
     return [entry.filename.removesuffix(".npy") for entry in entries]
 

@@ -87,9 +87,12 @@ def test_json(world, convert):
         "processed": 6,
         "median_ms": 20.0000005,
         "times_read_as": "seconds per frame, as no unit was given",
+        "held": {},
         "row_0_from_truth": [],
+        "other_trackers": [],
         "without_truth": [],
         "without_results": [],
+        "notes": [],
     }
 
 
@@ -287,7 +290,9 @@ def test_corners_name_the_file(world, convert):
 
 def test_lost_frames(world, convert):
     write(world / "KCF" / "a.txt", [*TRUTH[:5], ["nan"] * 4])
-    assert "a.txt, line 6: 'nan' is not a number" in convert("KCF")[2]
+    status, out, _ = convert("KCF")
+    assert status == 0
+    assert "had no box in 1 frames of 1 sequences (a); there its last one stands." in out
 
 
 def test_one_file_against_one_truth_file(world, convert):

@@ -25,6 +25,8 @@ def written(tmp_path):
         "1; 2.5; -3; 40\r\n5;6;7;8\r\n",
         "1, 2.5, -3, 40,\n5, 6, 7, 8,\n",
         "\ufeff1,2.5,-3,40\n5,6,7,8\n",
+        "1 ,2.5 ,\t-3, 40\n5, 6,7,  8\n",
+        "1,2.5,-3,40\n5,6,7,8\n".encode("utf-16"),
     ],
 )
 def test_separators(written, text):
@@ -43,6 +45,10 @@ def test_separators(written, text):
         ("1,nan\n", 1, "'nan'"),
         ("1,1e999\n", 1, "'1e999'"),
         ("1,,2\n", 1, "''"),
+        ("1,5;2,5\n", 1, "decimal points, and one separator"),
+        ("1,5 2,5\n", 1, "decimal points, and one separator"),
+        ("1,2\n10\t2,5\n", 2, "decimal points, and one separator"),
+        ("x,y\n1,2\n", 1, "'x' is not a number; the line looks like a header: remove it"),
     ],
 )
 def test_faults_name_the_line(written, text, line, problem):
@@ -59,6 +65,15 @@ def test_nan_where_allowed(written):
         read_numbers(written("nana,1\n"), nan=True)
 
 
+def test_rows_without_a_target_where_allowed(written):
+    table = read_numbers(written("1,2\n0\nnan,NaN,nan\n3,4\nnan\n"), nan=True, absent=True)
+    assert np.isnan(table[[1, 2, 4]]).all()
+    assert table[[0, 3]].tolist() == [[1, 2], [3, 4]]
+    assert np.isnan(read_numbers(written("nan,nan\nNaN,NaN\n"), nan=True, absent=True)).all()
+    with pytest.raises(LaeError, match="line 2: 1 columns, and the lines before have 2"):
+        read_numbers(written("1,2\n1\n"), nan=True, absent=True)
+
+
 @pytest.mark.parametrize(
     ("text", "problem"), [("", "empty"), ("\n\n", "empty"), (b"\xff\xfe\x00", "not a text file")]
 )
@@ -67,8 +82,8 @@ def test_no_table(written, text, problem):
         read_numbers(written(text))
 
 
-def test_utf_16_is_named(written):
-    for encoding in ("utf-16", "utf-16-le", "utf-16-be"):
+def test_utf_16_without_a_mark_is_named(written):
+    for encoding in ("utf-16-le", "utf-16-be"):
         with pytest.raises(LaeError, match="in UTF-16: save it as UTF-8"):
             read_numbers(written("1,2\n3,4\n".encode(encoding)))
 

@@ -1,5 +1,6 @@
 import contextlib
 import io
+import json
 import struct
 import subprocess
 import sys
@@ -15,7 +16,8 @@ from hypothesis import strategies as st
 
 from lae_sim.errors import LaeError
 from lae_sim.files import max_decoded
-from lae_sim.importers.results import find_results, given_times, read_mat, read_results
+from lae_sim.importers.pickles import load_plain
+from lae_sim.importers.results import Source, find_results, given_times, read_results
 
 BOXES = np.array([[1, 2, 3, 4], [5, 6, 7.5, 8]])
 TEXT = {"got10k": "1,2,3,4\n5,6,7.5,8\n", "pytracking": "1\t2\t3\t4\n5\t6\t7.5\t8\n"}
@@ -25,6 +27,10 @@ TIMES = "0.1\n0.026255\n"
 def write(path, text):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
+
+
+def read_mat(path):
+    return read_results("mat", Source("a", path), 1, None, measured=True)
 
 
 def read(root, **settings):
@@ -168,7 +174,10 @@ def test_mat_without_a_rate(tmp_path, fps):
         ({"res": "text"}, "table of numbers"),
         ({"res": np.array([[1, 2, 3, np.nan]])}, "row 1 is not finite"),
         ({"results": {"res": BOXES, "len": 3}}, "field 'len' is 3, and 'res' has 2 rows"),
-        ({"results": {"res": BOXES, "type": "ivtAff"}}, "type 'ivtAff'"),
+        ({"results": {"res": BOXES, "type": "polar"}}, "type 'polar'; known are rect, ivtaff"),
+        ({"results": {"res": BOXES, "type": 4}}, r"boxes of type array\("),
+        ({"rects": BOXES, "fps": 3}, "no field 'res' .*; there is rects, fps"),
+        ({"res": BOXES * np.nan}, "no box at all"),
         ({"results": np.array([{"res": BOXES}] * 3, dtype=object)}, "holds 3 runs"),
         ({"results": np.empty((0, 0))}, "no field 'res'"),
     ],
@@ -178,14 +187,6 @@ def test_mat_faults(tmp_path, content, problem):
     scipy.io.savemat(path, content)
     with pytest.raises(LaeError, match=problem):
         read_mat(path)
-
-
-def test_mat_7_3_says_what_to_do(tmp_path):
-    path = tmp_path / "a.mat"
-    for head in (b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512), b"\x89HDF\r\n\x1a\n"):
-        path.write_bytes(head)
-        with pytest.raises(LaeError, match=r"save\(\.\.\., '-v7'\)"):
-            read_mat(path)
 
 
 def test_damaged_mat(tmp_path):
@@ -275,13 +276,13 @@ def test_a_mat_bomb_takes_no_memory(tmp_path):
     path.write_bytes(HEADER + packed(zlib.compress(cells, 9)))
     code = (
         "import resource, sys; from pathlib import Path\n"
-        "from lae_sim.importers.results import read_mat\n"
+        "from lae_sim.importers.matlab import load_matlab\n"
         "from lae_sim.errors import LaeError\n"
         "from lae_sim.files import max_decoded\n"
         "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10\n"
         "before = peak()\n"
         "try:\n"
-        "    with max_decoded('32MiB'): read_mat(Path(sys.argv[1]))\n"
+        "    with max_decoded('32MiB'): load_matlab(Path(sys.argv[1]))\n"
         "except LaeError: print(peak() - before)\n"
     )
     done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, check=True)
@@ -327,6 +328,103 @@ def test_big_endian_mat(tmp_path):
     results = read_mat(path)
     assert results.boxes.tolist() == [expected["res"].tolist()] == [[1, 2, 3, 4]]
     assert results.mean_fps == expected["fps"] == 300
+
+
+def text(root, *lines):
+    write(root / "a.txt", "\n".join(lines) + "\n")
+    return read(root)[1]["a"].boxes.tolist()
+
+
+@pytest.mark.parametrize("none", ["NaN,NaN,NaN,NaN", "nan,-nan,+NAN,-nan(ind)", "0", "nan"])
+def test_rows_without_a_box(tmp_path, none):
+    boxes = text(tmp_path, "1,2,3,4", none, "5,6,7.5,8", none)
+    assert [boxes[0], boxes[2]] == BOXES.tolist()
+    assert np.isnan([boxes[1], boxes[3]]).all()
+
+
+def test_a_first_row_of_1_is_where_vots_unsupervised_runs_start(tmp_path):
+    boxes = text(tmp_path, "1", "1,2,3,4", "0", "5,6,7.5,8")
+    assert [boxes[1], boxes[3]] == BOXES.tolist()
+    assert np.isnan([boxes[0], boxes[2]]).all()
+
+
+@pytest.mark.parametrize(
+    ("lines", "problem"),
+    [
+        (["1,2,3,4", "1,nan,3,4"], "the box in row 2 is not finite; where the tracker has none"),
+        (["1,2,3,4", "1,2,inf,4"], "line 2: 'inf' is not a number"),
+        (["1,2,3,4", "inf,inf,inf,inf"], "line 2: 'inf' is not a number"),
+        (["1,2,3,4", "", "1,2,3,4"], "line 2: empty line; every frame needs its row"),
+        (["nan,nan,nan,nan"] * 3, "holds no box at all"),
+        (["0"] * 3, "columns; boxes have 4|holds no box at all"),
+        (["1", "1,2,3,4", "2", "0", "0", "1", "5,6,7,8"], "VOT's supervised results .*unsupervi"),
+        (["1,2,3,4", "1", "5,6,7,8", "1"], "VOT's supervised results"),
+        (["1", "m0,0,10,10,3,4,5", "m0,0,10,10,3,4,5"], "masks of VOT; boxes are needed"),
+        (["1", "1,2,3,4,5,6,7,8", "1,2,3,4,5,6,7,9"], "polygons of four corners; write x,y,w,h"),
+        (["1,2,3,4,5,6,7,8"] * 2, "polygons of four corners"),
+        (["1,1,10,20,30,40,0.9,-1,-1,-1"] * 2, "MOT's format"),
+        (["0 0.5 0.5 0.1 0.2"] * 2, "YOLO's format"),
+        (["x,y,w,h", "1,2,3,4"], "line 1: 'x' is not a number; the line looks like a header"),
+        (["<!DOCTYPE html>", "<title>Sign in</title>"], "a web page, as a failed download"),
+        (["version https://git-lfs.github.com/spec/v1", "oid sha256:0", "size 9"], "git lfs pull"),
+        (['{"images": [], "file_name": 1}'], "COCO's JSON"),
+    ],
+)  # fmt: skip
+def test_text_that_is_no_boxes_is_named(tmp_path, lines, problem):
+    with pytest.raises(LaeError, match=rf"a\.txt.*({problem})"):
+        text(tmp_path, *lines)
+
+
+def read_first(root):
+    kind, sources = find_results(root)
+    if kind == "lae-pvt":
+        return load_plain(sources[0].path)
+    return read_results(kind, sources[0], 1, None, measured=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "problem"),
+    [
+        ("a.mat", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
+        ("a.mat", b"<html><body>Sign in</body></html>", "web page"),
+        ("a.mat", b"MATLAB 5.0 MAT-file and no more", "not a MATLAB file of version 5 to 7.3"),
+        ("a.npz", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        ("a.pkl", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        ("a.json", b'[{"image_id": 1, "bbox": [1, 2, 3, 4], "score": 1}]', "COCO's JSON"),
+        ("a.json", b'{"AUC": 0.5}', "no field 'res' .*; there is AUC"),
+        ("a.zip", b"PK\x03\x04", r"a\.zip looks like an archive \(zip\); unpack it"),
+        ("a.tar.gz", b"\x1f\x8b\x08", r"a\.tar\.gz looks like a compressed file; unpack it"),
+        ("a.npy", b"\x93NUMPY\1\0", "a file of NumPy"),
+        ("a.xml", b"<?xml version='1.0'?>", "looks like XML"),
+        ("a.csv", b"x,y,w,h\n1,2,3,4\n", r"is a\.csv a table\? Name it <seq>\.txt"),
+        ("a.md", b"# Results\n", "give the folder of one tracker$"),
+    ],
+)
+@pytest.mark.parametrize("directly", [False, True])
+def test_files_of_other_formats_are_named(tmp_path, name, content, problem, directly):
+    path = tmp_path / "results" / name
+    path.parent.mkdir()
+    path.write_bytes(content)
+    with pytest.raises(LaeError, match=problem):
+        read_first(path if directly else path.parent)
+
+
+def test_json_results_and_json_beside_others(tmp_path):
+    run = [{"evalType": "OPE", "resType": "rect", "fps": 20, "res": BOXES.tolist()}]
+    write(tmp_path / "a.json", json.dumps(run))
+    kind, results = read(tmp_path)
+    assert (kind, results["a"].mean_fps) == ("json", 20)
+    np.testing.assert_array_equal(results["a"].boxes, BOXES)
+    write(tmp_path / "b.txt", TEXT["got10k"])
+    assert read(tmp_path)[0] == "ope"
+    assert list(read(tmp_path, wanted="json")[1]) == ["a"]
+
+
+def test_a_folder_of_trackers_folders(tmp_path):
+    write(tmp_path / "KCF" / "a.txt", TEXT["got10k"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(LaeError, match=r"give the folder of one tracker, such as .*KCF"):
+        find_results(tmp_path)
 
 
 def test_nothing_and_too_much(tmp_path):
