@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import tempfile
@@ -21,6 +22,7 @@ Result = TypeVar("Result")
 MAX_DECODED = "256MiB"
 """What a file may take in memory, once it is decoded, unless :func:`max_decoded` says otherwise."""
 
+_JSON_VALUE_BYTES = 80  # an empty list or dict, and its place in another
 _UNITS = {"": 0, "K": 10, "M": 20, "G": 30, "T": 40}
 _SIZE = re.compile(r"([0-9]{1,15}) ?([KMGT]?)(?:i?B)?\Z")
 # As numpy.errstate: a setting of whoever calls, not of the process.
@@ -94,9 +96,10 @@ class Budget:
         """
         self.left -= size
         if self.left < 0:
+            most = _MAX_DECODED.get() / 2**20
             raise self._error(
-                f"{self._path}: would take more than {_MAX_DECODED.get() / 2**20:,.4g} MiB of "
-                "memory, too much for such a file; if it is right, --max-decoded 1GiB allows more"
+                f"{self._path}: would take more than {most:,.4g} MiB of memory, too much for such "
+                f"a file; if it is right, --max-decoded {math.ceil(4 * most)}MiB allows more"
             )
 
 
@@ -107,6 +110,11 @@ def within_budget(path: str | os.PathLike[str], size: int) -> None:
         TooLargeError: if it is too much.
     """
     Budget(path).take(size)
+
+
+def json_memory(text: bytes) -> int:
+    """What the values of a JSON document take at most in memory, bytes, before they are decoded."""
+    return 2 * len(text) + _JSON_VALUE_BYTES * sum(map(text.count, (b",", b":", b"[", b"{")))
 
 
 def allowing(work: Callable[[Item], Result]) -> Callable[[Item], Result]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.errors import LaeError
+from lae_sim.files import TooLargeError
 
 HEAD_BYTES = 1 << 16
 """Of a file, as many are enough for :func:`foreign`."""
@@ -98,6 +99,8 @@ def told_apart(path: Path, *own: bytes) -> Iterator[None]:
     """
     try:
         yield
+    except TooLargeError:
+        raise
     except LaeError as error:
         try:
             with path.open("rb") as file:

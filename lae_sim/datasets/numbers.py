@@ -20,21 +20,21 @@ from lae_sim.files import Budget
 
 # A cell as a str, and its place in a list.
 _CELL_BYTES = 64
-_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 # 10,5;20,5 or 10,5 20,5: two numbers with decimal commas, or two points of a polygon?
 _COMMA = re.compile(r"[0-9],[0-9]")
 _NO_COMMA = re.compile(r"[0-9](?:\s*;\s*|\s+)[-+.0-9]")
 # Lengths are bounded, so that no number needs more than moderate exact arithmetic.
 NUMBER = re.compile(r"[+-]?(?:[0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})(?:[eE][+-]?[0-9]{1,3})?\Z")
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def read_lines(path: Path) -> list[str]:
     """The lines of a text file, stripped, without empty ones at the end.
 
     Raises:
-        LaeError: if the file cannot be read, is empty, looks like another format: it says which, or
-            would take too much memory (see :func:`lae_sim.files.max_decoded`).
+        LaeError: if the file cannot be read, is empty, looks like another format (it says which),
+            or would take too much memory (see :func:`lae_sim.files.max_decoded`).
     """
     lines = [line.strip() for line in read_text(path, Budget(path)).splitlines()]
     while lines and not lines[-1]:
@@ -138,14 +138,14 @@ def read_text(path: Path, budget: Budget) -> str:
     try:
         budget.take(path.stat().st_size)
         data = path.read_bytes()
+        budget.take(len(data) + _CELL_BYTES * data.count(b"\n"))  # as text, and its lines
         other = foreign(data[:HEAD_BYTES])
         if other is not None:
             raise LaeError(f"{path}: {other}")
-        budget.take(len(data) + _CELL_BYTES * data.count(b"\n"))  # as text, and its lines
-        if not data.startswith(_UTF16) and b"\0" in data[:4]:
+        utf_16 = data.startswith(_UTF_16)  # as Windows' shell writes it
+        if not utf_16 and b"\0" in data[:4]:
             raise LaeError(f"{path}: not a text file in UTF-8 but in UTF-16: save it as UTF-8")
-        # Windows' shell writes UTF-16
-        return data.decode("utf-16" if data.startswith(_UTF16) else "utf-8-sig")
+        return data.decode("utf-16" if utf_16 else "utf-8-sig")
     except FileNotFoundError as error:
         raise LaeError(f"{path}: no such file") from error
     except OSError as error:

@@ -187,7 +187,9 @@ def convert_results(
     schedule: dict[str, Any] = {"kind": "every-frame"}
     if kind == "lae-pvt":
         if given or time_unit:
-            raise LaeError("--time does not go with lae-pvt, whose runs hold their own times, in s")
+            raise LaeError(
+                "--time and --time-unit do not go with lae-pvt: its runs hold times in s"
+            )
         schedule = {"kind": "real-time", "schedule": {"policy": "latest"}}
         converted = _real_time(matched, annotations, clock, progress)
     else:

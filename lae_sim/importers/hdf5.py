@@ -48,7 +48,7 @@ def load_hdf5(path: Path) -> dict[str, Any]:
     try:
         with h5py.File(path, "r") as file:
             return _Reader(h5py, file, Budget(path)).members(file, 0)
-    except TooLargeError:
+    except (TooLargeError, MemoryError):
         raise
     except Exception as error:  # a damaged file can raise anything
         text = " ".join(str(error).split())[:200]
@@ -145,12 +145,13 @@ class _Reader:
         if filters and not packed:
             raise ValueError("it is packed as MATLAB packs none")
         count = dataset.id.get_num_chunks()
-        if count > _MAX_CHUNKS:
-            raise ValueError("it is in too many pieces")
+        if size > self._budget.left or count > _MAX_CHUNKS:
+            raise ValueError("it is too large")
         for i in range(count):
             chunk = dataset.id.get_chunk_info(i)
-            self._budget.take(chunk.size)
+            if chunk.size > self._budget.left:
+                raise ValueError("it is too large")
             if packed and not chunk.filter_mask:
                 _, raw = dataset.id.read_direct_chunk(chunk.chunk_offset)
                 if len(zlib.decompressobj().decompress(raw, size + 1)) > size:
-                    raise ValueError("it unpacks to more than it says")
+                    raise ValueError("it is too large when unpacked")

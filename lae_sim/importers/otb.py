@@ -22,9 +22,7 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.errors import LaeError, shown
-from lae_sim.files import within_budget
-
-_BYTES_PER_CHARACTER = 32  # of what Python makes of JSON such as [1,{},[]]
+from lae_sim.files import json_memory, within_budget
 
 
 @dataclass(frozen=True)
@@ -48,8 +46,10 @@ def load_json(path: Path) -> Any:
             :func:`lae_sim.files.max_decoded`).
     """
     try:
-        within_budget(path, path.stat().st_size * _BYTES_PER_CHARACTER)
-        return json.loads(path.read_bytes(), parse_int=float)
+        within_budget(path, path.stat().st_size)
+        data = path.read_bytes()
+        within_budget(path, json_memory(data))
+        return json.loads(data, parse_int=float)
     except OSError as error:
         raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:

@@ -93,28 +93,27 @@ def load_plain(path: Path) -> Any:
     Raises:
         LaeError: if the file asks for anything else, which it names, or is damaged.
     """
+    budget = Budget(path)
     with told_apart(path, b"\x80"):
-        return _loaded(path, Budget(path))
-
-
-def _loaded(path: Path, budget: Budget) -> Any:
-    try:
-        budget.take(path.stat().st_size)
-        data = path.read_bytes()
-        _check_operations(data, budget)
-        # Python 2 keeps bytes and text alike; latin1 keeps every byte.
-        return _Decoder().decode(_Unpickler(io.BytesIO(data), encoding="latin1").load())
-    except TooLargeError:
-        raise
-    except LaeError as error:
-        raise LaeError(
-            f"{path}: {error}: a pickle of results may hold numbers, text, lists, dicts and "
-            "numeric NumPy arrays only"
-        ) from error
-    except FileNotFoundError as error:
-        raise LaeError(f"{path}: no such file") from error
-    except Exception as error:  # a hostile pickle can raise anything
-        raise LaeError(f"{path}: not a readable pickle: {ascii(str(error))[1:-1][:200]}") from error
+        try:
+            budget.take(path.stat().st_size)
+            data = path.read_bytes()
+            _check_operations(data, budget)
+            # Python 2 keeps bytes and text alike; latin1 keeps every byte.
+            return _Decoder().decode(_Unpickler(io.BytesIO(data), encoding="latin1").load())
+        except (TooLargeError, MemoryError):
+            raise
+        except LaeError as error:
+            raise LaeError(
+                f"{path}: {error}: a pickle of results may hold numbers, text, lists, dicts and "
+                "numeric NumPy arrays only"
+            ) from error
+        except FileNotFoundError as error:
+            raise LaeError(f"{path}: no such file") from error
+        except Exception as error:  # a hostile pickle can raise anything
+            raise LaeError(
+                f"{path}: not a readable pickle: {ascii(str(error))[1:-1][:200]}"
+            ) from error
 
 
 def _check_operations(data: bytes, budget: Budget) -> None:

@@ -357,7 +357,7 @@ def _npz_names(path: Path) -> list[str]:
             with ZipFile(path) as archive:
                 entries = archive.infolist()
         except Exception as error:  # a damaged file can raise anything
-            raise LaeError(f"{path}: not a readable .npz file: {error}") from error
+            raise LaeError(f"{path}: not a readable .npz file: {error!s:.200}") from error
     within_budget(path, sum(entry.file_size for entry in entries))
     return [entry.filename.removesuffix(".npy") for entry in entries]
 
@@ -372,10 +372,11 @@ def _npz_boxes(path: Path, name: str) -> Floats:
             within_budget(path, math.prod(shape) * (kind.itemsize + np.dtype(np.float64).itemsize))
             with archive.open(member) as file:
                 boxes = np.lib.format.read_array(file, allow_pickle=False)
-    except LaeError:
+    except (LaeError, MemoryError):
         raise
     except Exception as error:  # a damaged file can raise anything
-        raise LaeError(f"{path}: array {name[:80]!r} cannot be read: {error}") from error
+        text = " ".join(str(error).split())[:200]  # NumPy quotes the whole head
+        raise LaeError(f"{path}: array {name[:80]!r} cannot be read: {text}") from error
     return _checked_boxes(boxes, f"{path}, array {name!r}")
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.errors import LaeError, TraceError, hint, shown
-from lae_sim.files import Budget, sequence_names, written_whole
+from lae_sim.files import Budget, json_memory, sequence_names, written_whole
 from lae_sim.trace.checks import COLUMN_TYPES, RowChecker, check_schema
 from lae_sim.trace.columns import BOX, TRUTH, Rows, checksums
 from lae_sim.trace.locate import is_url, opened
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 HELD_FRAMES = 1 << 18
 _ROW_BYTES = 8 + 3 * 8 * 4 + 4  # truth, box and what is put together of them, time and score
-_JSON_FACTOR = 8  # objects of Python take more than their text
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -272,7 +271,7 @@ class _StoredRecordings:
                     f"{self.path}: metadata key 'lae_sim' is missing: is this a lae_sim trace? "
                     "See 'lae-sim convert --help' to make one"
                 )
-            Budget(self.path, TraceError).take(_JSON_FACTOR * len(stored))
+            Budget(self.path, TraceError).take(json_memory(stored))
             try:
                 return Metadata.parse(stored), file.metadata.num_rows
             except TraceError as error:
@@ -377,7 +376,11 @@ class _StoredRecordings:
             raise TraceError(
                 f"{self.path}: column 'sequence' is missing: is this a lae_sim trace?"
             ) from error
-        except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+        except (
+            pa.ArrowException,
+            OSError,
+            ValueError,
+        ) as error:  # no memory is not the file's fault
             if not is_url(self.path) and not os.path.lexists(self.path):
                 raise TraceError(f"{self.path}: no such file") from error  # constant:47ms, too
             raise TraceError(f"{self.path}: not a readable Parquet file: {error}") from error

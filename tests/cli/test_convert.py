@@ -187,7 +187,10 @@ def test_real_time_pickles(world, convert):
     for recording, frames in zip(trace, ([0, 3, 4, 5], [0, 2, 3, 5]), strict=True):
         schedule = replay_sequence(recording, Clock.at(trace.metadata.fps)).schedule
         assert schedule.frames.tolist() == frames
-    assert "--time does not go with lae-pvt" in convert("rt", "--time", "constant:1ms", out="u")[2]
+    assert (
+        "--time and --time-unit do not go with lae-pvt"
+        in convert("rt", "--time", "constant:1ms", out="u")[2]
+    )
 
 
 def test_a_hostile_pickle(world, convert):

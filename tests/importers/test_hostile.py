@@ -9,6 +9,7 @@ default)::
 from __future__ import annotations
 
 import io
+import json
 import pickle
 import struct
 import sys
@@ -71,6 +72,10 @@ RUN = {
 }
 PICKLES = [pickle.dumps(RUN, protocol) for protocol in range(6)]
 TIMES = [text_of(SECONDS), b"time_ms\n" + text_of(1000 * SECONDS)]
+JSONS = [
+    json.dumps([{"res": BOXES.tolist(), "fps": 20.5, "type": "rect", "len": 8}]).encode(),
+    json.dumps({"results": {"res": BOXES.tolist(), "resType": "rect", "fps": 20}}).encode(),
+]
 NPYS = [npy_of(BOXES), npy_of(BOXES.astype(np.int8)), npy_of(np.asfortranarray(BOXES))]
 STUDY = b'traces = ["a.parquet"]\nfps = [29.97, "trace"]\nlatencies = "recorded"\nseed = 3\n'
 CSV = b"tracker,sequence,frames,fps\nMY,car,8,25.5\nother,car,,30\n"
@@ -189,6 +194,7 @@ KINDS = {
     "packed": Kind("results/car.mat", [MATS[0], MATS[2]], EXTREMES, packed_mat, time="measured"),
     "npz": Kind("MY.npz", NPYS, NUMPY, zipped, results="MY.npz"),
     "zip": Kind("MY.npz", [zipped(data) for data in NPYS], EXTREMES, results="MY.npz"),
+    "json": Kind("results/car.json", JSONS, [*WORDS, b"{", b"}", b"]", b"null"], time="measured"),
     "pickle": Kind("results/car.pkl", PICKLES, OPCODES, time="measured"),
     "boxes": Kind("results/car.txt", [text_of(BOXES, separator) for separator in ",\t "]),
     "times": Kind("results/car_time.txt", TIMES, time="measured"),

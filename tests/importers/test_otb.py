@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lae_sim.errors import LaeError
-from lae_sim.files import TooLargeError, max_decoded
+from lae_sim.files import max_decoded
 from lae_sim.importers.otb import load_json, read_run
 
 SQUARE = np.array([[10, 50, 50, 10], [20, 20, 60, 60]], float)  # x and y of its corners
@@ -120,8 +120,10 @@ def test_numbers_of_any_length_are_read(tmp_path: Path) -> None:
     assert (found.boxes[0, 3], found.mean_fps) == (np.inf, None)
 
 
-def test_large_json_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["[" + "[]," * 20_000 + "0]", '{"a": "%s"}' % ("x" * 600_000)])
+def test_large_json_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.json"
-    path.write_text("[1, 2, 3, 4]")
-    with max_decoded(64), pytest.raises(TooLargeError, match=r"a\.json"):
+    path.write_text(text)
+    load_json(path)
+    with max_decoded("1MiB"), pytest.raises(LaeError, match=r"a\.json: would take more than 1 MiB"):
         load_json(path)
