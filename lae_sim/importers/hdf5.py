@@ -145,13 +145,12 @@ class _Reader:
         if filters and not packed:
             raise ValueError("it is packed as MATLAB packs none")
         count = dataset.id.get_num_chunks()
-        if size > self._budget.left or count > _MAX_CHUNKS:
-            raise ValueError("it is too large")
+        if count > _MAX_CHUNKS:
+            raise ValueError("it is in too many pieces")
         for i in range(count):
             chunk = dataset.id.get_chunk_info(i)
-            if chunk.size > self._budget.left:
-                raise ValueError("it is too large")
+            self._budget.take(chunk.size)
             if packed and not chunk.filter_mask:
                 _, raw = dataset.id.read_direct_chunk(chunk.chunk_offset)
                 if len(zlib.decompressobj().decompress(raw, size + 1)) > size:
-                    raise ValueError("it is too large when unpacked")
+                    raise ValueError("it unpacks to more than it says")
