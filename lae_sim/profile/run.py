@@ -340,6 +340,12 @@ def run_profile(
         raise KeyboardInterrupt
     if not written:
         raise LaeError("no sequence could be profiled")
+    resized = read_trace(written[0].path).metadata.resized
+    if resized:
+        notice(
+            f"note: the images of {len(resized)} sequences change size, such as those of "
+            f"{resized[0]!r}: the trace says from which frame on"
+        )
     return Profile(tuple(summary(task.path) for task in written), failed)
 
 
