@@ -151,6 +151,7 @@ def _text(summary: ConversionSummary, out: Path) -> str:
             f"{summary.sequences} sequences ({listed(summary.row_0_from_truth)}); there the trace "
             "starts from the truth, as the tracker did."
         )
+    lines += [f"Note: {note}." for note in summary.notes]
     if summary.without_truth:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:

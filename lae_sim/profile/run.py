@@ -284,6 +284,8 @@ def run_profile(
         LaeError: as :func:`profile_tracker`.
     """
     dataset = find_dataset(plan.dataset, plan.root, plan.sequences, plan.box, plan.fps)
+    for note in dataset.notes:
+        notice(note)
     path = _trace_path(out, f"{plan.tracker}-{dataset.name}")
     check_folders([str(path)])
     unfinished = path.with_suffix(".unfinished")

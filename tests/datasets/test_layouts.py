@@ -280,3 +280,19 @@ def test_what_is_missing_is_named(tmp_path, walk):
         find_dataset(root=tmp_path / "only")
     with pytest.raises(LaeError, match="no images there; --box needs a folder of images"):
         find_dataset(root=tmp_path / "only", box=(1, 2, 3, 4))
+
+
+def test_flags_of_absence_and_what_is_wrong_with_them(tmp_path):
+    for name in ("boat-1", "boat-2", "car-1"):
+        folder = tmp_path / name.partition("-")[0] / name
+        images(folder / "img", "%08d.jpg", range(1, 5))
+        truth(folder / "groundtruth.txt", 4)
+    (tmp_path / "boat" / "boat-1" / "out_of_view.txt").write_text("0,0,1,0")
+    (tmp_path / "boat" / "boat-2" / "out_of_view.txt").write_text("0,0,1")
+    dataset = find_dataset(root=tmp_path)
+    flags = [sequence.visible for sequence in dataset.sequences]
+    assert flags[0].tolist() == [True, True, False, True]
+    assert flags[1:] == [None, None]
+    [note] = dataset.notes
+    assert note.startswith("sequence 'boat-2': flags of absence are left out: ")
+    assert note.endswith("out_of_view.txt: 3 flags, and there are 4 frames")
