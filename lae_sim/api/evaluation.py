@@ -358,7 +358,7 @@ class EvaluationResult:
         Returns:
             A row per world frame: ``frame``; the answer ``x, y, w, h`` in pixels; ``source_frame``,
             the frame of the output that it comes from; the truth ``truth_x`` to ``truth_h``; the
-            ``iou`` of the two.
+            ``iou`` of the two; ``visible``, where the trace says whether the target is.
 
         Raises:
             LaeError: if there is no such trace, sequence, forecaster or permitted latency.
@@ -385,7 +385,7 @@ class EvaluationResult:
             chosen,
             scenario.costs.get(forecaster, 0),
         )
-        truth = run.recording.truth
+        truth, visible = run.recording.truth, run.recording.visible
         return pd.DataFrame(
             {
                 "frame": np.arange(len(run)),
@@ -393,6 +393,7 @@ class EvaluationResult:
                 "source_frame": found.source_frame,
                 **dict(zip(("truth_x", "truth_y", "truth_w", "truth_h"), truth.T)),
                 "iou": iou(found.boxes, truth),
+                **({} if visible is None else {"visible": visible}),
             }
         )
 

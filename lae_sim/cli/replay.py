@@ -52,7 +52,7 @@ policies:     latest, fifo, every:N, shrinking-tail:TIME (expected processing ti
 latencies:    recorded, by-call, constant:TIME, resample:SEED, lognormal:SEED,
               bootstrap:SEED[:BLOCK], or your own, package.module:object; each may end in
               ,init=TIME, what the initialisation takes: constant:47ms,init=800ms
-conventions:  pysot, elae, otb, got10k, got10k-101, exclude
+conventions:  pysot, elae, otb, lasot, got10k, got10k-101, exclude
 """
 
 

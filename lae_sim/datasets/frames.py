@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lae_sim._arrays import Floats
+from lae_sim._arrays import Bools, Floats
 from lae_sim.errors import LaeError
 
 _THREADS = 4
@@ -34,12 +34,15 @@ class ImageSequence:
             row is the initial box.
         read: ``read(frame)`` decodes (or renders) a frame, in any order, from any thread.
         attributes: the dataset's attributes of the sequence, such as ``"Occlusion"``.
+        visible: False where the dataset says that the target is absent or fully covered, bool [T];
+            None = it says nothing.
     """
 
     name: str
     truth: Floats
     read: Callable[[int], Image]
     attributes: tuple[str, ...] = ()
+    visible: Bools | None = None
 
     def __len__(self) -> int:
         """Number of frames T."""
@@ -57,13 +60,13 @@ class Dataset:
         name: the dataset's name, such as ``"DTB70"``.
         fps: its frame rate, frames per second, exact.
         sequences: sorted by name.
-        notes: which files beside the images and the truth could not be read, and why.
+        notes: what of it was left out, a sentence each.
     """
 
     name: str
     fps: Fraction
     sequences: Sequence[ImageSequence]
-    notes: Sequence[str] = ()
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"<Dataset {self.name!r}: {len(self.sequences)} sequences at {self.fps} fps>"

@@ -11,6 +11,7 @@ import itertools
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.datasets.absence import read_visible
 from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.synthetic import synthetic_dataset
@@ -117,8 +119,13 @@ def find_dataset(
         _sequence(root, sequence, truth.files[sequence], attributes.of.get(sequence, ()))
         for sequence in _choose(sequences, truth.files, str(root), truth.match)
     ]
+    notes = list(attributes.notes)
+    for i, sequence in enumerate(chosen_sequences):
+        visible, note = read_visible(truth.files[sequence.name], len(sequence))
+        chosen_sequences[i] = replace(sequence, visible=visible)
+        notes += [f"sequence {sequence.name!r}: {note}"] if note else []
     fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
-    return Dataset(name, fps, chosen_sequences, attributes.notes)
+    return Dataset(name, fps, chosen_sequences, tuple(notes))
 
 
 def _without_truth(

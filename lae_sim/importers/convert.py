@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Ints
+from lae_sim.datasets.absence import absence_files, read_visible
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
 from lae_sim.engine.clock import Clock, Number, parse_fps
 from lae_sim.errors import LaeError, shown
@@ -53,7 +54,7 @@ class ConversionSummary:
             the tracker started; in the trace it is that box.
         without_truth: results that were left out, since they have no ground truth.
         without_results: sequences of the ground truth that have no results.
-        notes: what else could not be read, and was left out.
+        notes: what else is to be said, a sentence each.
         files: what was read.
     """
 
@@ -179,6 +180,7 @@ def convert_results(
     as_published = recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
     attributes = read_attributes(annotations)
+    recordings, notes = _flagged(recordings, annotations)
     metadata = Metadata.new(
         rate,
         **schedule,
@@ -201,13 +203,16 @@ def convert_results(
         frames=len(elapsed),
         processed=int((elapsed >= 0).sum()),
         median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
-        row_0_from_truth=[new.name for new, old in zip(recordings, as_published) if new is not old],
+        row_0_from_truth=[
+            new.name for new, old in zip(recordings, as_published) if new.boxes is not old.boxes
+        ],
         without_truth=without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
-        notes=list(attributes.notes),
+        notes=[*notes, *attributes.notes],
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
             *annotations.files.values(),
+            *(file for truth in annotations.files.values() for file in absence_files(truth)),
             *((given.file,) if given and given.file else ()),
         ],
     )
@@ -349,6 +354,26 @@ def _started(recording: Recording, results: Path) -> Recording:
     if not row_0_is_off(truth, boxes):
         return recording
     return replace(recording, boxes=np.concatenate([truth[:1], boxes[1:]]))
+
+
+def _flagged(
+    recordings: Iterable[Recording], truth: GroundTruth
+) -> tuple[list[Recording], list[str]]:
+    """The recordings with the dataset's flags of absence, and what is to be said of these."""
+    flagged, notes = [], []
+    for recording in recordings:
+        visible, note = read_visible(truth.files[recording.name], len(recording))
+        flagged.append(replace(recording, visible=visible))
+        notes += [f"sequence {recording.name!r}: {note}"] if note else []
+    absent = [int((~each.visible).sum()) for each in flagged if each.visible is not None]
+    if any(absent):
+        notes.insert(
+            0,
+            f"the target is said to be absent in {sum(absent):,} frames, in "
+            f"{np.count_nonzero(absent)} of {len(flagged)} sequences; --convention lasot leaves "
+            "them out",
+        )
+    return flagged, notes
 
 
 def _sequence_entries(

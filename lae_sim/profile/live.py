@@ -248,7 +248,14 @@ class Live:
         elapsed[frames] = self._elapsed_ns
         scores[frames] = [np.nan if a.score is None else a.score for a in self._answers]
         return LiveRun(
-            Recording.new(self._sequence.name, self._sequence.truth, boxes, elapsed, scores),
+            Recording.new(
+                self._sequence.name,
+                self._sequence.truth,
+                boxes,
+                elapsed,
+                scores,
+                visible=self._sequence.visible,
+            ),
             frames,
             np.array([answer.elapsed_ns for answer in self._answers], np.int64),
             sum(answer.cpu_ns for answer in self._answers),

@@ -276,8 +276,11 @@ def convention_in_words(convention: Convention) -> str:
         "positive": "x, y, width and height are > 0",
         "finite": "it has no NaN",
     }[convention.valid]
+    if convention.by_visible:
+        valid += " and the target is not said to be absent"
+    divided = ", but are divided by" if convention.of_all else ""
     invalid = (
-        "frames without leave both metrics"
+        f"frames without leave both metrics{divided}"
         if convention.leaves_out
         else "others are misses of AUC, "
         + (
