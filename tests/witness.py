@@ -466,11 +466,17 @@ def write_plain(
 
 def same(a: Recording, b: Recording) -> bool:
     """Whether two recordings are equal bit for bit."""
-    return a.name == b.name and all(
+    optional = ("arrival_ns", "visible")
+    if a.name != b.name or any(
+        (getattr(a, o) is None) != (getattr(b, o) is None) for o in optional
+    ):
+        return False
+    present = [field for field in optional if getattr(a, field) is not None]
+    return all(
         getattr(a, field).dtype == getattr(b, field).dtype
         and getattr(a, field).shape == getattr(b, field).shape
         and getattr(a, field).tobytes() == getattr(b, field).tobytes()
-        for field in ("truth", "boxes", "elapsed_ns", "score")
+        for field in ("truth", "boxes", "elapsed_ns", "score", *present)
     )
 
 

@@ -103,6 +103,11 @@ class Journal:
             for sequence in self.finished(name)
         ]
 
+    def columns(self, name: str) -> frozenset[str]:
+        """The optional columns that any of a pass's recordings has."""
+        parts = [self._folder / name / _file_name(sequence) for sequence in self.finished(name)]
+        return frozenset(column for part in parts for column in read_trace(part).columns)
+
     def recordings(self, name: str) -> Iterator[Recording]:
         """The recordings of a pass, sequence by sequence, sorted by name."""
         for sequence in self.finished(name):

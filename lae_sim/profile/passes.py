@@ -291,7 +291,8 @@ def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> boo
     recordings: Iterable[Recording] = journal.recordings(task.name)
     if task.metadata.kind == "restarts":  # "a b" before "a", but "a@1+3" before "a b@1+3"
         recordings = sorted(recordings, key=lambda recording: recording.name)
-    write_trace(Trace(Metadata.of(document), recordings), task.path)
+    columns = journal.columns(task.name)
+    write_trace(Trace(Metadata.of(document), recordings, columns=columns), task.path)
     return True
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -17,8 +17,8 @@ from lae_sim.errors import LaeError, TraceError
 
 FORMAT = "lae-trace"
 VERSION = "1.0"
-RESTARTS_VERSION = "1.1"
-"""Of traces of kind restarts, which readers of 1.0 do not know; all others are readable by them."""
+NEWER_VERSION = "1.1"
+"""Of traces with optional columns, and of restarts, whose kind readers of 1.0 do not know."""
 KINDS = ("every-frame", "real-time", "restarts")
 TRACES_TIMES = "the trace's times: "
 
@@ -119,6 +119,12 @@ class Metadata:
             )
         return cls(_fps(document), _kind(document), _checked(document))
 
+    def with_columns(self) -> Metadata:
+        """That of a trace which has optional columns: of a version that has them."""
+        if int(self.document["version"].split(".")[1]) >= 1:
+            return self
+        return replace(self, document={**self.document, "version": NEWER_VERSION})
+
     def dumps(self) -> bytes:
         """The document as JSON text in UTF-8, keys in order."""
         return json.dumps(self.document, sort_keys=True, allow_nan=False).encode()
@@ -206,7 +212,7 @@ class Metadata:
 
 def version_of(kind: str) -> str:
     """The oldest version of the format whose readers know a trace of this kind."""
-    return RESTARTS_VERSION if kind == "restarts" else VERSION
+    return NEWER_VERSION if kind == "restarts" else VERSION
 
 
 def _finite(text: str) -> float:

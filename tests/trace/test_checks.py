@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from witness import BOX, TRUTH, columns_of, moving, write_plain
+from witness import BOX, MINIMAL, TRUTH, columns_of, moving, write_plain
 
 import lae_sim.trace.file
 from lae_sim.errors import TraceError
@@ -125,6 +125,60 @@ def test_a_fault_is_named(
     monkeypatch.setattr(lae_sim.trace.file, "BATCH_ROWS", batch)
     where = f"faulty.parquet: column '{column}', sequence '{sequence}', frame {frame}: .*"
     with pytest.raises(TraceError, match=where + f"({cause})"):
+        validate(path)
+
+
+NEWER = {**MINIMAL, "version": "1.1"}
+
+
+@pytest.mark.parametrize("batch", [1 << 16, 7, 1])
+@pytest.mark.parametrize(
+    ("row", "value", "sequence", "frame", "cause"),
+    [
+        (ROW, None, "Gull2", 5, "null"),
+        (0, None, "Car1", 0, "null"),
+        (ROW, 4 * 33_000_000, "Gull2", 5, "not after the frame before"),
+        (ROW, -1, "Gull2", 5, "not after"),
+        (ROW, 2**63 - 1, "Gull2", 6, "not after"),
+        (20, 5, "Gull2", 0, "count from frame 0"),
+        (0, -5, "Car1", 0, "count from frame 0"),
+    ],
+)
+def test_a_fault_in_arrivals_is_named(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    batch: int,
+    row: int,
+    value: Any,
+    sequence: str,
+    frame: int,
+    cause: str,
+) -> None:
+    columns = {**columns_of(GROUP), "arrival_ns": [33_000_000 * i for i in range(20)] * 2}
+    validate(write_plain(tmp_path / "faulty.parquet", columns, NEWER))
+    columns["arrival_ns"][row] = value
+    path = write_plain(tmp_path / "faulty.parquet", columns, NEWER)
+    monkeypatch.setattr(lae_sim.trace.file, "BATCH_ROWS", batch)
+    where = f"faulty.parquet: column 'arrival_ns', sequence '{sequence}', frame {frame}: .*"
+    with pytest.raises(TraceError, match=where + f"({cause})"):
+        validate(path)
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "message"),
+    [
+        ("arrival_ns", [i / 30 for i in range(20)] * 2, "is double, must be int64.*seconds"),
+        ("visible", [1] * 40, "is int64, must be bool"),
+        ("visible", ["yes"] * 40, "is string, must be bool"),
+        ("arrival_ns", [33 * i for i in range(20)] * 2, "look like milliseconds .33 from frame"),
+    ],
+)
+def test_optional_columns_of_other_types_are_named(
+    tmp_path: Path, column: str, values: list[Any], message: str
+) -> None:
+    columns = {**columns_of(GROUP), column: values}
+    path = write_plain(tmp_path / "faulty.parquet", columns, NEWER)
+    with pytest.raises(TraceError, match=f"column '{column}'.*{message}"):
         validate(path)
 
 
