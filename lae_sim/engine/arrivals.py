@@ -86,3 +86,30 @@ class _ArrivalClock(Clock):
     def tail_shrinks(self, newest: Count, now: Count, later: int) -> Any:
         then = now + later
         return then - self.arrival(self.newest(then)) < now - self.arrival(newest)
+
+    def frame_time(self, frame: Count) -> Any:
+        time = self.arrival(frame) / self.frame_ticks
+        return time if isinstance(frame, np.ndarray) else FrameTime(time, frame)
+
+
+class FrameTime(float):
+    """When a frame arrives, in nominal frame intervals after frame 0; as an index, its number.
+
+    Example:
+        >>> from lae_sim.engine import Clock
+        >>> clock = Clock.at(25).with_arrivals([0, 40_000_000, 120_000_000])  # one was dropped
+        >>> frame = clock.frame_time(2)
+        >>> frame - 1, ["a", "b", "c"][frame]
+        (2.0, 'c')
+    """
+
+    def __new__(cls, time: float, number: int) -> FrameTime:
+        """The time of the frame of that number."""
+        made = super().__new__(cls, time)
+        made._number = number
+        return made
+
+    _number: int
+
+    def __index__(self) -> int:
+        return self._number

@@ -282,6 +282,22 @@ class Clock:
         """
         return now - newest * self.frame_ticks >= self.frame_ticks - later % self.frame_ticks
 
+    def frame_time(self, frame: Count) -> Any:
+        """When a frame arrives, in nominal frame intervals after frame 0: its number, or a float.
+
+        It is its number where frames arrive evenly. Elsewhere it is a float, and of a single frame
+        a :class:`.arrivals.FrameTime`, which knows the number as well.
+        """
+        return frame
+
     def milliseconds(self, frames: Fraction | int) -> float:
         """A time given in frames as milliseconds, for display."""
         return float(frames / self.fps * 1000)
+
+    def arrival_ms(self, frame: int, sigma: Fraction = Fraction(0)) -> float:
+        """When a frame's query is, ``sigma`` nominal intervals after its arrival, for display."""
+        return self.milliseconds(Fraction(self.arrival(frame), self.frame_ticks) + sigma)
+
+    def query(self, frame: int, sigma: Fraction = Fraction(0)) -> int:
+        """The tick of that query, or the one before where it is between two ticks."""
+        return self.arrival(frame) + int(sigma * self.frame_ticks // 1)

@@ -102,11 +102,21 @@ class Staleness:
     Attributes:
         mismatch_sum, mismatch_max: over the world frames, frames, int64 [S, M].
         longest_hold: most queries in a row with one answering output, frames, int64 [S, M].
+        age_sum, age_max, longest_stale: the same in time, by when frames arrive, in nominal frame
+            intervals, float64 [S, M]; the permitted latency is not in it.
     """
 
     mismatch_sum: Ints
     mismatch_max: Ints
     longest_hold: Ints
+    age_sum: Floats
+    age_max: Floats
+    longest_stale: Floats
+
+    @classmethod
+    def of(cls, pairing: Pairing) -> Staleness:
+        """That of paired outputs and queries."""
+        return cls(*(getattr(pairing, field.name) for field in fields(cls)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +229,7 @@ def evaluate_runs(
     """Score the runs of one trace, in groups, so that no more than the scores is kept.
 
     Args:
-        runs: one per sequence, all of one clock.
+        runs: one per sequence, all of one frame rate.
         metadata: of the trace, for image sizes.
         forecasters: factories by name.
         sigmas: distinct permitted latencies in frames, ascending.
@@ -356,9 +366,7 @@ class _Scoring:
                 observer(one)
         return Evaluation(
             replay=_replay_statistics(runs, offline, pairings[0]),
-            staleness=Staleness(
-                pairings[0].mismatch_sum, pairings[0].mismatch_max, pairings[0].longest_hold
-            ),
+            staleness=Staleness.of(pairings[0]),
             scores=scores,
             failure=np.stack([each.failure for each in scored]),
             curves=Curves(
@@ -509,9 +517,11 @@ def lanes_of(runs: Sequence[Run], pairing: Pairing, fed: Histories, image_sizes:
         image_sizes: of each run, float64 [S, 2], infinite = unknown.
     """
     boxes = np.concatenate([run.boxes for run in runs])
-    frames = pairing.frames.take(fed.output)
+    numbers = pairing.frames.take(fed.output)
+    frames = pairing.frame_times(np.repeat(fed.sequence, np.diff(fed.offsets)), numbers)
     fed_boxes = boxes.take(fed.output, axis=0)
-    return Lanes(fed.offsets, frames, fed_boxes, image_sizes[fed.sequence])
+    sizes = image_sizes[fed.sequence]
+    return Lanes(fed.offsets, frames, fed_boxes, sizes, None if frames is numbers else numbers)
 
 
 def _answers(
@@ -541,13 +551,19 @@ def _answers(
     for fed in histories(pairing, memoryless=defines(factory, "memoryless")).parts(_PART):
         paired = pairs(pairing, fed)
         lanes = lanes_of(runs, pairing, fed, image_sizes)
+        frame: Ints | Floats = paired.frame
+        number: Ints | None = None
+        if lanes.numbers is not None:
+            sequence = fed.sequence.take(lanes.lane(paired.item))
+            frame, number = pairing.frame_times(sequence, paired.frame), paired.frame
         distinct = {id(one): one for one in factories}.values()
         if len(distinct) == 1:
-            yield fed, paired, forecast(factories[0], lanes, paired.item, paired.frame, name)
+            yield fed, paired, forecast(factories[0], lanes, paired.item, frame, name, number)
             continue
         answered = np.empty((len(paired.item), 4))
         for one in distinct:  # at once where several sequences share one
             chosen = np.array([other is one for other in factories])[fed.sequence]
             part, asked, item = lanes.chosen(chosen, paired.item)
-            answered[asked] = forecast(one, part, item, paired.frame[asked], name)
+            some = None if number is None else number[asked]
+            answered[asked] = forecast(one, part, item, frame[asked], name, some)
         yield fed, paired, answered

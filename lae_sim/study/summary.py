@@ -345,13 +345,15 @@ def _staleness(scores: Scores, s: int) -> Staleness:
     """How old answers are, and how long the target is held, in world time, at one sigma."""
     sigma, clock = scores.setting.world.sigmas[s], Clock.at(scores.setting.fps)
     frames, frame_ms = scores.once["world_frames"], clock.milliseconds(1)
-    mismatch = scores.means["mismatch_mean"][:, s] * frames
-    mean = float(mismatch.sum() / frames.sum())
+    mismatch, age = (
+        float((scores.means[name][:, s] * frames).sum() / frames.sum())
+        for name in ("mismatch_mean", "age_mean")
+    )
     staleness = Staleness(
-        mismatch_mean=mean,
-        age_ms=(mean + float(sigma)) * frame_ms,
-        age_max_ms=float(scores.means["mismatch_max"][:, s].max() + sigma) * frame_ms,
-        longest_stale_ms=float(scores.means["longest_hold"][:, s].max()) * frame_ms,
+        mismatch_mean=mismatch,
+        age_ms=(age + float(sigma)) * frame_ms,
+        age_max_ms=float(scores.means["age_max"][:, s].max() + sigma) * frame_ms,
+        longest_stale_ms=float(scores.means["longest_stale"][:, s].max()) * frame_ms,
     )
     if s:
         return staleness
