@@ -15,9 +15,7 @@ from lae_sim.engine.clock import MAX_INT64, Clock
 from lae_sim.errors import LaeError, shown
 
 
-def arrival_clock(
-    ticks_per_ns: int, frame_ticks: int, arrival_ns: Ints | Sequence[int]
-) -> Clock:
+def arrival_clock(ticks_per_ns: int, frame_ticks: int, arrival_ns: Ints | Sequence[int]) -> Clock:
     """See :meth:`.clock.Clock.with_arrivals`; a clock without a table where they are even."""
     times = np.asarray(arrival_ns)
     if times.ndim != 1 or not len(times) or times.dtype.kind not in "iu":

@@ -125,7 +125,8 @@ class Pairing:
     @property
     def age_max(self) -> Floats:
         """The largest such time, nominal frame intervals, float64 [S, M]."""
-        return self._longest(self.mismatch_max, lambda o: (self.frames[o, None], self.end[o] - 1))
+        last = np.maximum(self.end - 1, 0)  # see mismatch_max on outputs that answer nothing
+        return self._longest(self.mismatch_max, lambda o: (self.frames[o, None], last[o]))
 
     @property
     def longest_stale(self) -> Floats:

@@ -101,7 +101,9 @@ class Inputs:
         scale = np.exp(sides[:, :1].mean(axis=2, keepdims=True))
         states = np.concatenate([centres / scale, sides], axis=2)
         intervals = (window.frames[:, :-1] - window.frames[:, 1:]) * window.known[:, 1:]
-        velocities = (states[:, :-1] - states[:, 1:]) / np.where(intervals > 0, intervals, 1)[..., None]
+        velocities = (states[:, :-1] - states[:, 1:]) / np.where(intervals > 0, intervals, 1)[
+            ..., None
+        ]
         shape = [np.log(scale[:, 0, 0] / 50), sides[:, 0, 0] - sides[:, 0, 1]]
         parts = (velocities, intervals, np.maximum(ahead, 0), np.stack(shape, axis=1))
         return cls(*(torch.from_numpy(part.astype(np.float32)) for part in parts))

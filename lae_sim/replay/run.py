@@ -397,9 +397,7 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
             yield from ((r, next(replayed)) for r in some for _ in jobs)
 
 
-def _replayed(
-    jobs: Sequence[_Job], services: Sequence[Service], policy: Policy
-) -> Iterator[Run]:
+def _replayed(jobs: Sequence[_Job], services: Sequence[Service], policy: Policy) -> Iterator[Run]:
     clocks = [job.clock for job in jobs]
     schedules = simulate_lanes([len(job) for job in jobs], clocks, services, policy)
     for job in jobs:
