@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lae_sim._arrays import Floats
+from lae_sim._arrays import Floats, Ints
 from lae_sim.errors import LaeError
 
 _THREADS = 4
@@ -34,12 +34,15 @@ class ImageSequence:
             row is the initial box.
         read: ``read(frame)`` decodes (or renders) a frame, in any order, from any thread.
         attributes: the dataset's attributes of the sequence, such as ``"Occlusion"``.
+        arrival_ns: when each frame arrives, ns after the first, int64 [T], ascending from 0; None =
+            at the dataset's frame rate.
     """
 
     name: str
     truth: Floats
     read: Callable[[int], Image]
     attributes: tuple[str, ...] = ()
+    arrival_ns: Ints | None = None
 
     def __len__(self) -> int:
         """Number of frames T."""
@@ -57,11 +60,16 @@ class Dataset:
         name: the dataset's name, such as ``"DTB70"``.
         fps: its frame rate, frames per second, exact.
         sequences: sorted by name.
+        frame_times: how frames come where image numbers are missing: ``"numbers"`` or ``"even"``;
+            None where none is.
+        notes: what a user should know of them, a sentence each.
     """
 
     name: str
     fps: Fraction
     sequences: Sequence[ImageSequence]
+    frame_times: str | None = None
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"<Dataset {self.name!r}: {len(self.sequences)} sequences at {self.fps} fps>"

@@ -11,6 +11,7 @@ import itertools
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
+from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, image_number, missing, note
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.synthetic import synthetic_dataset
 from lae_sim.engine.clock import Number, parse_fps
@@ -60,6 +62,7 @@ def find_dataset(
     sequences: str | Sequence[str] | None = None,
     box: Sequence[float] | None = None,
     fps: Number | None = None,
+    frame_times: str | None = None,
 ) -> Dataset:
     """Find a dataset's images and ground truth.
 
@@ -73,6 +76,9 @@ def find_dataset(
         box: the first box ``x, y, w, h`` in pixels, for images or a video without ground truth.
         fps: frames per second; by default the dataset's (30, or 10 for UAV123_10fps and GOT-10k)
             or the video's own.
+        frame_times: where numbers are missing among a sequence's images, as if the camera had
+            dropped frames: ``"numbers"`` lets each image come at the time of its number, ``"even"``
+            one after another. Without it such images are refused.
 
     Returns:
         The dataset. Where only the first box is known, the truth after it is NaN.
@@ -90,6 +96,7 @@ def find_dataset(
     """
     sequences = None if sequences is None else sequence_names(sequences)
     fps = None if fps is None else parse_fps(fps)
+    check_frame_times(frame_times)
     if box is not None and len(box) != 4:
         raise LaeError(f"box: x, y, w, h in pixels, not {shown(box)}")
     if not isinstance(root, (str, os.PathLike, type(None))):
@@ -104,18 +111,37 @@ def find_dataset(
         return Dataset("synthetic", fps or Fraction(30), [synthetic[name] for name in chosen])
     root = Path(root)
     if root.is_file() or box is not None:
-        return _without_truth(name, root, sequences, box, fps)
+        return _without_truth(name, root, sequences, box, fps, frame_times)
     name = _SPELLINGS.get((name or "").lower(), name)
     truth = find_truth(root / "anno" / name if name and (root / "anno" / name).is_dir() else root)
     if name is None:
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
-    chosen_sequences = [
+    found = [
         _sequence(root, sequence, truth.files[sequence], attributes.get(sequence, ()))
         for sequence in _choose(sequences, truth.files, str(root), truth.match)
     ]
-    return Dataset(name, fps or Fraction(_FPS.get(name, 30)), chosen_sequences)
+    return _timed(name, fps or Fraction(_FPS.get(name, 30)), found, frame_times)
+
+
+def _timed(
+    name: str,
+    fps: Fraction,
+    sequences: Sequence[tuple[ImageSequence, Sequence[int]]],
+    frame_times: str | None,
+) -> Dataset:
+    """The dataset of sequences with the numbers of their images."""
+    made = [sequence for sequence, _ in sequences]
+    gaps = [(sequence.name, numbers) for sequence, numbers in sequences if missing(numbers)]
+    if not gaps:
+        return Dataset(name, fps, made)
+    if frame_times is None:
+        raise ask(*gaps[0], fps)
+    if frame_times == "numbers":  # of all: a trace has the times of every frame, or of none
+        made = [replace(each, arrival_ns=arrivals(numbers, fps)) for each, numbers in sequences]
+    notes = (note((gap for gap, _ in gaps), frame_times),)
+    return Dataset(name, fps, made, frame_times, notes)
 
 
 def _without_truth(
@@ -124,6 +150,7 @@ def _without_truth(
     sequences: Sequence[str] | None,
     box: Sequence[float] | None,
     fps: Fraction | None,
+    frame_times: str | None,
 ) -> Dataset:
     """A video or a folder of images of which only the first box is known."""
     sequence = root.resolve().stem if root.is_file() else root.resolve().name
@@ -131,6 +158,7 @@ def _without_truth(
     if box is None:
         raise LaeError(f"{root}: a video needs the target's first box: --box x,y,w,h")
     read: Callable[[int], Image]
+    numbers: Sequence[int] = ()
     if root.is_file():
         read = video = Video(root)
         length, fps = len(video), fps or video.fps
@@ -143,11 +171,16 @@ def _without_truth(
         if not paths:
             raise LaeError(f"{root}: no images there; --box needs a folder of images, or a video")
         read, length = partial(_read, sequence, paths), len(paths)
+        numbers = _numbers(paths)
     truth = _only_first(np.array([box], np.float64), length)
-    return Dataset(name or sequence, fps or Fraction(30), [ImageSequence(sequence, truth, read)])
+    images = [(ImageSequence(sequence, truth, read), numbers)]
+    return _timed(name or sequence, fps or Fraction(30), images, frame_times)
 
 
-def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) -> ImageSequence:
+def _sequence(
+    root: Path, name: str, file: Path, attributes: tuple[str, ...]
+) -> tuple[ImageSequence, Sequence[int]]:
+    """A sequence, and the numbers of its images."""
     truth = read_truth(file)
     paths, first = _find_images(root, name, file)
     if len(truth) == 1:
@@ -160,7 +193,8 @@ def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) ->
             f"sequence {name!r}: {len(paths)} images in {paths[0].parent}, but {len(truth)} "
             f"annotations in {file}"
         )
-    return ImageSequence(name, truth, partial(_read, name, paths), attributes)
+    made = ImageSequence(name, truth, partial(_read, name, paths), attributes)
+    return made, _numbers(paths)
 
 
 def _find_images(root: Path, name: str, file: Path) -> tuple[list[Path], int | None]:
@@ -196,7 +230,7 @@ def _clip_first(file: Path) -> int:
 
 def _part(paths: list[Path], first: int | None, length: int, where: str) -> list[Path]:
     """``length`` images from number ``first``, or from the start; none may be missing between."""
-    numbers = [int("".join(re.findall("[0-9]+", path.stem)[-1:]) or -1) for path in paths]
+    numbers = _numbers(paths)
     if first is not None:
         if first not in numbers:
             raise LaeError(f"{where}: no image number {first}, where the sequence starts")
@@ -207,6 +241,10 @@ def _part(paths: list[Path], first: int | None, length: int, where: str) -> list
         gap = numbers[int(np.argmax(steps != 1))]
         raise LaeError(f"{where}: the image after number {gap} is missing, or there twice")
     return paths[:length]
+
+
+def _numbers(paths: Sequence[Path]) -> list[int]:
+    return [image_number(path.stem) for path in paths]
 
 
 def _list_images(folder: Path) -> list[Path]:

@@ -336,8 +336,14 @@ class Gaps:
 
     def _live(self, start: Start, sequence: ImageSequence, read: Callable[[int], Image]) -> Live:
         first = start.name.start
-        truth = sequence.truth[first : first + start.frames[-1] + 1]
-        part = ImageSequence(str(start.name), truth, lambda frame: read(first + frame))
+        rows = slice(first, first + start.frames[-1] + 1)
+        arrived = None if sequence.arrival_ns is None else sequence.arrival_ns[rows]
+        part = ImageSequence(
+            str(start.name),
+            sequence.truth[rows],
+            lambda frame: read(first + frame),
+            arrival_ns=None if arrived is None else arrived - arrived[0],
+        )
         return Live(part, **self._options)
 
     def _made(
