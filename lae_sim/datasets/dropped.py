@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
-from itertools import islice
+from itertools import islice, pairwise
 from statistics import median
 
 import numpy as np
@@ -37,7 +37,7 @@ def step_of(numbers: Sequence[int]) -> int:
 
     It is the greatest common divisor of all steps.
     """
-    steps = [b - a for a, b in zip(numbers, numbers[1:])]
+    steps = [b - a for a, b in pairwise(numbers)]
     if not steps or min(steps) <= 0:
         return 0
     step = math.gcd(*steps)
@@ -49,7 +49,7 @@ def missing(numbers: Sequence[int], most: int = 4) -> list[int]:
     step = step_of(numbers)
     if not step:
         return []
-    gone = (n for a, b in zip(numbers, numbers[1:]) for n in range(a + step, b, step))
+    gone = (n for a, b in pairwise(numbers) for n in range(a + step, b, step))
     return list(islice(gone, most))
 
 

@@ -216,6 +216,27 @@ def _find_images(root: Path, name: str, file: Path) -> tuple[list[Path], int | N
     )
 
 
+def image_numbers(root: Path, name: str, file: Path, length: int) -> list[int]:
+    """The numbers of a sequence's images, where they are beside its ground truth; else none.
+
+    Args:
+        root: the dataset's folder.
+        name: the sequence's.
+        file: its ground truth.
+        length: number of frames.
+    """
+    try:
+        paths, first = _find_images(root, name, file)
+    except LaeError:
+        return []
+    numbers = _numbers(paths)
+    if len(numbers) > length:
+        first = first or _OTB_FIRST.get((name, length))
+        start = numbers.index(first) if first in numbers else 0
+        numbers = numbers[start : start + length]
+    return numbers if len(numbers) == length else []
+
+
 def _clip_first(file: Path) -> int:
     """The number of the first image of one of UAV123's clips, from the lengths before it."""
     first = _CLIP_FIRST.get(file.stem)

@@ -299,13 +299,8 @@ class Runs:
         strides = [trace.metadata.stride for trace in (self.trace, *self.strided)]
         if self.strided and len(set(strides)) != len(strides):
             raise LaeError("two of the passes have the same stride: give each stride once")
-        recorded_fps = self.trace.metadata.fps
-        if self.arrivals == "recorded" and self.clock.fps != recorded_fps:
-            raise LaeError(
-                f"the trace says when each of its frames arrived, at a nominal {recorded_fps} "
-                f"frames/s: for {self.clock.fps} frames/s forget the arrivals, and space the frames "
-                "evenly: --forget-arrivals (forget_arrivals=True)"
-            )
+        if not self.forget_arrivals:
+            check_rate(self.trace, self.clock.fps)
 
     @property
     def arrivals(self) -> str | None:
@@ -313,6 +308,14 @@ class Runs:
         if not self.trace.has_arrivals:
             return None
         return "forgotten" if self.forget_arrivals else "recorded"
+
+    def notes(self) -> list[str]:
+        """A note on when frames arrive, if the trace says so."""
+        if self.arrivals is None:
+            return []
+        if self.forget_arrivals:
+            return ["the trace's arrival times are forgotten: frames arrive evenly"]
+        return ["frames arrive when the trace says that they did, not evenly"]
 
     @property
     def strided(self) -> tuple[Trace, ...]:
@@ -361,6 +364,20 @@ class Runs:
 
     def __repr__(self) -> str:
         return f"<Runs of {self.trace!r} at {self.clock.fps} fps>"
+
+
+def check_rate(trace: Trace, fps: Fraction) -> None:
+    """Check that a trace can be replayed at a frame rate.
+
+    Raises:
+        LaeError: if it says when each frame arrived, and is of another rate.
+    """
+    if trace.has_arrivals and fps != trace.metadata.fps:
+        raise LaeError(
+            f"the trace says when each of its frames arrived, at a nominal {trace.metadata.fps} "
+            f"frames/s: for {fps} frames/s forget the arrivals, and space the frames evenly: "
+            "--forget-arrivals (forget_arrivals = true)"
+        )
 
 
 def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[int, Run]]:

@@ -88,7 +88,8 @@ def test_even_arrivals_make_the_even_clock() -> None:
 def test_clocks_of_other_arrivals_differ() -> None:
     one, other = (EVEN.with_arrivals([0, ns]) for ns in (50 * MS, 60 * MS))
     assert len({one, other, EVEN}) == 3
-    assert not one.is_even and EVEN.is_even
+    assert not one.is_even
+    assert EVEN.is_even
     assert repr(one) == "<Clock at 25 fps, 2 arrival times>"
 
 
