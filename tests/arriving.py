@@ -1,4 +1,4 @@
-"""Worlds whose frames arrive at times of their own, worked out in Fractions: an independent witness.
+"""Worlds whose frames arrive at times of their own, in Fractions: an independent witness.
 
 It shares no code with the package: seconds instead of ticks, loops over all frames, no search.
 """

@@ -311,5 +311,5 @@ def test_many_sequences_are_replayed_as_each_by_itself() -> None:
 
 def test_instants_beyond_64_bits_name_the_sequence() -> None:
     far = replace(recording_of(None, 2), arrival_ns=np.array([0, 2**62]))
-    with pytest.raises(LaeError, match="sequence 'a': the last frame arrives after .* beyond 64"):
+    with pytest.raises(LaeError, match=r"sequence 'a': the last frame arrives after .* beyond 64"):
         list(lae_sim.replay_trace(trace_of(far)))
