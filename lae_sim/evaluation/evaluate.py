@@ -142,6 +142,8 @@ class Evaluation:
         scores: per metric of ``METRICS``, float64 [F, S, M] in 0..1; NaN = leaves the mean.
         failure: the first world frame whose answer does not overlap the truth at all, int64
             [F, S, M]; the number of world frames if there is none, -1 without a truth to score by.
+        failure_time: when that frame arrives, or the stream ends, in nominal frame intervals,
+            float64 [F, S, M]; -1 without a truth to score by.
         curves: at one permitted latency, [F, S, ...].
         offline: per metric, of the trace's boxes at their own frames, float64 [S]; NaN where the
             trace does not hold every frame.
@@ -153,6 +155,7 @@ class Evaluation:
     staleness: Staleness
     scores: Mapping[str, Floats]
     failure: Ints
+    failure_time: Floats
     curves: Curves
     offline: Mapping[str, Floats]
     offline_curves: Curves
@@ -166,6 +169,7 @@ class Evaluation:
             staleness=_joined([part.staleness for part in parts]),
             scores={m: np.concatenate([p.scores[m] for p in parts], axis=1) for m in METRICS},
             failure=np.concatenate([part.failure for part in parts], axis=1),
+            failure_time=np.concatenate([part.failure_time for part in parts], axis=1),
             curves=_joined([part.curves for part in parts], axis=1),
             offline={m: np.concatenate([p.offline[m] for p in parts]) for m in METRICS},
             offline_curves=_joined([part.offline_curves for part in parts]),
@@ -360,6 +364,9 @@ class _Scoring:
         kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs]
         scored = self._scored(runs, pairings, kept)
         scores = {m: np.stack([each.scores[m] for each in scored]) for m in METRICS}
+        failure = np.stack([each.failure for each in scored])
+        of_sequence = np.broadcast_to(np.arange(len(runs))[:, None], failure.shape)
+        failed_at = pairings[0].frame_times(of_sequence, np.maximum(failure, 0))
         for place, run in enumerate(runs if self.observers else ()):
             one = ScoredRun(run, kept[place], place, self.sigmas, pairings)
             for observer in self.observers:
@@ -368,7 +375,8 @@ class _Scoring:
             replay=_replay_statistics(runs, offline, pairings[0]),
             staleness=Staleness.of(pairings[0]),
             scores=scores,
-            failure=np.stack([each.failure for each in scored]),
+            failure=failure,
+            failure_time=np.where(failure < 0, -1.0, failed_at),
             curves=Curves(
                 np.stack([each.success for each in scored]),
                 np.stack([each.precision for each in scored]),

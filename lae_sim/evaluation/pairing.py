@@ -145,8 +145,7 @@ class Pairing:
         """
         longest = frames.astype(np.float64)
         for s, clock in self._uneven():
-            length = int(self.lengths[s])
-            ticks = np.append(clock.arrival(np.arange(length)), clock.end(length))
+            ticks = self._instants(s)
             begin, end = span(slice(self.offsets[s], self.offsets[s + 1]))
             longest[s] = (ticks[end] - ticks[begin]).max(axis=0) / clock.frame_ticks
         return longest
@@ -156,15 +155,19 @@ class Pairing:
 
         Args:
             sequence: by its place, int64 [P].
-            frame: world frame, int64 [P].
+            frame: world frame, int64 [P]; the one after the last is the end of the stream.
         """
         if all(clock.is_even for clock in self.clocks):
             return frame
-        every = zip(self.clocks, self.lengths.tolist())
-        table = [clock.frame_time(np.arange(length)) for clock, length in every]
-        starts = np.cumsum(self.lengths) - self.lengths
-        times: Floats = np.concatenate(table).take(starts.take(sequence) + frame)
+        table = np.concatenate([self._instants(s) for s in range(len(self.clocks))])
+        starts = np.cumsum(self.lengths + 1) - self.lengths - 1
+        times: Floats = table.take(starts.take(sequence) + frame) / self.clocks[0].frame_ticks
         return times
+
+    def _instants(self, sequence: int) -> Ints:
+        """The ticks at which the frames of a sequence arrive, and its end, int64 [T + 1]."""
+        clock, length = self.clocks[sequence], int(self.lengths[sequence])
+        return np.append(clock.arrival(np.arange(length)), clock.end(length))
 
     def _uneven(self) -> Iterator[tuple[int, Clock]]:
         """The sequences whose frames arrive at times of their own, by their places."""

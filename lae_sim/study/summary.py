@@ -45,11 +45,12 @@ class Scores:
         setting: the first of the settings, which differ in their repetitions.
         forecaster, convention: names.
         sequences: names, S of them.
-        means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``;
-            of ``mismatch_max`` and ``longest_hold`` the largest (frames). Where something is
+        means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``
+            and ``age_mean``; of ``age_max`` and ``longest_stale`` the largest. Where something is
             modelled, ``modelled_auc`` and ``modelled_dp20`` are there and below, those of exact
             replays as they are.
-        repeated: ``auc``, ``dp20`` and ``failure_frame`` at the first sigma, float64 [R, S].
+        repeated: ``auc``, ``dp20``, ``failure_frame`` and ``failure_time`` at the first sigma,
+            float64 [R, S].
         over_sigmas: ``auc`` and ``dp20`` as plain means over sigma, float64 [R, S].
         once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms``, ``init_ms``,
             ``lost_share`` and the offline scores, float64 [S].
@@ -105,9 +106,9 @@ class Scores:
         return self.over_sigmas if over_sigmas else self.repeated
 
 
-_WORST = {"mismatch_max", "longest_hold"}
-_STALENESS = ("mismatch_mean", *sorted(_WORST))
-_REPEATED = ("auc", "dp20", "failure_frame")
+_WORST = {"age_max", "longest_stale"}
+_STALENESS = ("mismatch_mean", "age_mean", *sorted(_WORST))
+_REPEATED = ("auc", "dp20", "failure_frame", "failure_time")
 _ONCE = ("world_frames", "processed", "elapsed_ms", "init_ms", "lost_share",
          *(f"offline_{m}" for m in METRICS))  # fmt: skip
 _MODELLED = tuple(f"modelled_{metric}" for metric in MODELLED)
@@ -360,7 +361,7 @@ def _staleness(scores: Scores, s: int) -> Staleness:
     failure = scores.repeated["failure_frame"]
     scored = failure >= 0
     failed = (failure < frames)[scored]
-    median = _median_survival(failure[scored], failed)
+    median = _median_survival(scores.repeated["failure_time"][scored], failed)
     return replace(
         staleness,
         failed=float(failed.mean()) if len(failed) else None,
