@@ -38,7 +38,7 @@ def lanes_and_queries(
         starts = np.sort(random.choice(np.arange(1, 40), len(later), replace=False))
         resized[int(lane)] = ImageSizes.of([0, *starts], [sizes[lane], *later])
     fed = np.concatenate(frames).astype(np.int64)
-    lanes = Lanes(offsets, fed, np.concatenate(boxes), sizes, resized)
+    lanes = Lanes(offsets, fed, np.concatenate(boxes), sizes, None, resized)
     item = np.sort(random.integers(0, offsets[-1], 3 * offsets[-1]))
     ahead = random.integers(0, 9, len(item))
     return lanes, item, lanes.frames[item] + ahead

@@ -10,7 +10,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import argument, exit_status, new_parser
+from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct
 from lae_sim.progress import ProgressBar
@@ -83,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         help="other ground truth for one sequence",
     )
     add("--skip-missing", action="store_true", help="leave out results without ground truth")
+    add_frame_times(add)
     add("--image-size", type=argument(_size), metavar="WxH", help="image size, such as 1280x720")
     add(
         "--force",
@@ -118,6 +119,7 @@ def _convert(arguments: argparse.Namespace) -> None:
             truth_files=truth_files,
             skip_missing=arguments.skip_missing,
             image_size=arguments.image_size,
+            frame_times=arguments.frame_times,
             progress=bar,
         )
     check_distinct([arguments.out], summary.files)
@@ -132,6 +134,7 @@ def _convert(arguments: argparse.Namespace) -> None:
 
 def _text(summary: ConversionSummary, out: Path) -> str:
     """The summary for people."""
+    from lae_sim.datasets.dropped import note
     from lae_sim.importers.convert import listed
 
     processed = "every frame"
@@ -145,6 +148,9 @@ def _text(summary: ConversionSummary, out: Path) -> str:
     ]
     if "note" in summary.timing:
         lines.append(f"Note: {summary.timing['note']}.")
+    if summary.frame_times:
+        said = note(summary.numbers_missing, summary.frame_times)
+        lines.append(f"{said[0].upper()}{said[1:]}.")
     if summary.row_0_from_truth:
         lines.append(
             f"Row 0 is not the initial box in {len(summary.row_0_from_truth)} of "

@@ -66,7 +66,7 @@ class TunedKalman:
         return Kalman(box, image_size, self)
 
     def forecast_lanes(
-        self, lanes: Lanes, item: Ints, frame: Ints, restart_iou: float | None = None
+        self, lanes: Lanes, item: Ints, frame: Ints | Floats, restart_iou: float | None = None
     ) -> Floats:
         """The same for many lanes at once; restarts as in :func:`filter_lanes`."""
         states, place = filter_lanes(lanes, self, restart_iou)
@@ -226,7 +226,7 @@ class Kalman:
         return self._settings.boxes(forecast[None])
 
     @staticmethod
-    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The paper's filter over many lanes at once; equal bit for bit."""
         return PAPER.forecast_lanes(lanes, item, frame)
 
@@ -260,7 +260,7 @@ class KalmanLaePvt(Kalman):
         return box
 
     @staticmethod
-    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once; equal bit for bit."""
         forecasts = PAPER.forecast_lanes(lanes, item, frame, RESTART_IOU)
         return clip(forecasts, lanes.boxes[item], lanes.image_sizes_at(item, frame))

@@ -65,15 +65,15 @@ def run_real_time(
     Args:
         sequence: frames, and the truth, whose first box initialises the tracker.
         tracker: a tracker with a stopwatch.
-        clock: the world's clock.
+        clock: the world's clock; the sequence's own arrival times count, where it has some.
         policy: which frame is next.
         options: see :class:`Live`.
 
     Raises:
         LaeError: if the first box or a frame cannot be used, or the tracker fails.
     """
-    live = Live(sequence, tracker, **options)
-    schedule = simulate(len(sequence), clock, live, policy)
+    live = Live(sequence, tracker, clock=clock, **options)
+    schedule = simulate(len(sequence), live.clock, live, policy)
     return live.result(schedule.frames)
 
 
@@ -120,6 +120,9 @@ def run_every_frame(
     )
 
 
+_EVEN = Clock.at(Fraction(1))
+
+
 class Live:
     """The service that runs a tracker through one sequence, and keeps its answers."""
 
@@ -133,6 +136,7 @@ class Live:
         include_decode: bool = False,
         forecaster_ns: int | None = 0,
         progress: Callable[[int], object] = lambda frames: None,
+        clock: Clock = _EVEN,
     ) -> None:
         """Check that the tracker can start.
 
@@ -147,6 +151,8 @@ class Live:
             include_decode: count the decoding of a frame as part of its processing.
             forecaster_ns: what the pre-forecaster adds to a frame's time, ns; None to measure it.
             progress: told how many more world frames are done, after each processed one.
+            clock: the world's, by which a pre-forecaster counts time where frames have arrival
+                times; of frames that arrive evenly it counts the numbers.
 
         Raises:
             LaeError: if the sequence has no first box, or the tracker's search cannot be set.
@@ -159,6 +165,7 @@ class Live:
             )
         if pre_forecaster is not None and not tracker.sets_search:
             raise LaeError("a pre-forecaster needs a tracker whose search can be set: translate it")
+        self.clock = clock.with_arrivals(sequence.arrival_ns)
         self._sequence = sequence
         self._tracker = tracker
         self._pre_forecaster = pre_forecaster
@@ -209,7 +216,7 @@ class Live:
             if self._sizes[-1] != self._sizes[-2] and isinstance(self._forecaster, Resizable):
                 self._forecaster.resize(self._sizes[-1])
             before = perf_counter_ns()
-            predicted = self._forecaster.predict(frame)
+            predicted = self._forecaster.predict(self.clock.frame_time(frame))
             spent = perf_counter_ns() - before
             if self._keep_size:
                 predicted = resized(predicted, self._last_box)
@@ -219,7 +226,7 @@ class Live:
             self._last_box = answer.box
             with explained("the pre-forecaster"):
                 before = perf_counter_ns()
-                self._forecaster.update(frame, answer.box)
+                self._forecaster.update(self.clock.frame_time(frame), answer.box)
                 spent += perf_counter_ns() - before
         self._forecasting_ns = spent if self._forecaster_ns is None else self._forecaster_ns
         return answer
@@ -254,7 +261,8 @@ class Live:
                 boxes,
                 elapsed,
                 scores,
-                visible=self._sequence.visible,
+                self._sequence.arrival_ns,
+                self._sequence.visible,
             ),
             frames,
             np.array([answer.elapsed_ns for answer in self._answers], np.int64),

@@ -127,6 +127,12 @@ def parse_timing(text: str) -> tuple[str, Timing]:
                 f"{path}: has {len(recording)} frames of sequence {sequence.name!r}, which has "
                 f"{len(sequence)} here"
             )
+        theirs, own = recording.arrival_ns, sequence.arrival_ns  # none says nothing of it
+        if theirs is not None and (own is None or not np.array_equal(theirs, own)):
+            raise LaeError(
+                f"{path}: the frames of sequence {sequence.name!r} arrived at other times than "
+                "they do here (--frame-times)"
+            )
         return source(recording)
 
     return f"{Path(path).name} ({trace.metadata.device}){init}, not measured here", timing

@@ -24,6 +24,8 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import lru_cache
 from math import ceil, inf, log
+from operator import index
+from typing import Any
 
 import numpy as np
 
@@ -140,6 +142,7 @@ class SearchModel:
         frames: Ints,
         recorded: Sequence[RecordedAnswers],
         image_sizes: ImageSizes | None = None,
+        times: Sequence[Any] | None = None,
     ) -> Outcomes:
         """What a tracker of each likely reach would have answered.
 
@@ -149,7 +152,10 @@ class SearchModel:
             recorded: recorded answers for these frames: those that are replayed, and those of other
                 runs that are likely.
             image_sizes: for the pre-forecaster, if known.
+            times: the frames as the pre-forecaster is given them (``Clock.frame_time``), where they
+                arrive at times of their own.
         """
+        asked = frames.tolist() if times is None else times
         jumps = [jump for jump in self.jumps.get(recording.name, ()) if _recorded(recording, jump)]
         reaches = _within(self.reaches, recording, jumps) if self.known else self.reaches
         resumed = _resumed(recording, frames, jumps)
@@ -159,7 +165,7 @@ class SearchModel:
         total = sum(answers.weight for answers in recorded)
         for answers in recorded:
             share = answers.weight / total
-            walk = self._walker(recording, frames, answers, resumed, image_sizes)
+            walk = self._walker(recording, asked, answers, resumed, image_sizes)
             for again, part in _AGAIN.items() if self.reach is not None else ((True, 1.0),):
                 each = share * part / (len(reaches) if self.known else 1)
                 same_to = -inf
@@ -181,7 +187,7 @@ class SearchModel:
     def _walker(
         self,
         recording: Recording,
-        frames: Ints,
+        frames: Sequence[Any],
         answers: RecordedAnswers,
         resumed: tuple[int, bool],
         image_sizes: ImageSizes | None,
@@ -288,7 +294,7 @@ class _Walk:
 
 
 def _forecast_walk(
-    frames: Ints,
+    frames: Sequence[Any],
     answers: RecordedAnswers,
     resumed: tuple[int, bool],
     reach: float,
@@ -302,12 +308,12 @@ def _forecast_walk(
     answered, lost = [rows[0]], [False]
     same_to = inf
     resumed_at, found = resumed
-    for k, (frame, box) in enumerate(zip(frames[1:].tolist(), rows[1:]), 1):
-        resize(forecaster, image_sizes, frame)
+    for k, (frame, box) in enumerate(zip(frames[1:], rows[1:]), 1):
+        resize(forecaster, image_sizes, index(frame))
         predicted = forecaster.predict(frame)
         if keep_size:
             predicted = resized(predicted, answered[-1])
-        size = None if image_sizes is None else image_sizes.at(frame)
+        size = None if image_sizes is None else image_sizes.at(index(frame))
         centre_x, centre_y, w, h = search_region(predicted, size)
         missed = k < resumed_at or (lost[-1] and k > resumed_at and not again)
         if not missed and (k > resumed_at or not found):

@@ -205,7 +205,7 @@ class Scene:
         caption = (
             self.run.recording.name,
             f"frame {frame} of {last + 1}",
-            f"{self.run.schedule.clock.milliseconds(frame) / 1000:.3f} s",
+            f"{self.run.schedule.clock.arrival_ms(frame) / 1000:.3f} s",
             f"output of frame {source}, {frame - source} before",
         )
         boxes = {name: found.boxes[frame] for name, found in self.answers.items()}
@@ -214,6 +214,8 @@ class Scene:
 
     def film(self, path: str | Path) -> None:
         """Write an MP4 of all frames, whole or not at all, with a progress bar on a terminal.
+
+        It shows as many frames a second as the world does, whenever each of them arrived.
 
         Raises:
             LaeError: if it cannot be written, or a frame cannot be read.

@@ -45,7 +45,8 @@ class ImageSizes:
     """The sizes of a sequence's images, of which most have one.
 
     Attributes:
-        starts: the frames from which on images have another size, ascending; the first is 0.
+        starts: the frames from which on images have another size, ascending; the first is 0. (In
+            the lanes of forecasters they are times where frames are.)
         sizes: width and height from then on, pixels.
 
     Example:
@@ -55,7 +56,7 @@ class ImageSizes:
         ((640, 360), (320, 180), True)
     """
 
-    starts: tuple[int, ...]
+    starts: tuple[float, ...]
     sizes: tuple[tuple[int, int], ...]
 
     @classmethod
@@ -79,7 +80,7 @@ class ImageSizes:
         """Whether there are several."""
         return len(self.sizes) > 1
 
-    def at(self, frame: int) -> tuple[int, int]:
+    def at(self, frame: float) -> tuple[int, int]:
         """Width and height of a frame's image, pixels."""
         return self.sizes[bisect_right(self.starts, frame) - 1]
 

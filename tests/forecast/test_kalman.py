@@ -200,7 +200,7 @@ def test_clipping_follows_images_that_change_size() -> None:
     sizes = ImageSizes((0, 2, 5), ((120, 90), (110, 30), (900, 900)))
     lanes = Lanes(
         np.array([0, 1, 2]), np.array([0, 0]), np.array([box] * 2), np.array([[120, 90.0]] * 2),
-        {1: sizes},
+        resized=        {1: sizes},
     )  # fmt: skip
     item, frame = np.array([0, 0, 1, 1, 1, 1]), np.array([0, 6, 1, 2, 4, 5])
     whole, narrow = [90, 10, 30, 40], [90, 10, 20, 20]
