@@ -58,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--fps",
         help="world frames per second, such as 29.97 or 30000/1001 (default: 30, or 10 if the "
-        "dataset's name says 10fps)",
+        "dataset's name says 10fps); of NfS, the set: 30 or 240",
     )
     add(
         "--time",
@@ -151,11 +151,11 @@ def _text(summary: ConversionSummary, out: Path) -> str:
             f"{summary.sequences} sequences ({listed(summary.row_0_from_truth)}); there the trace "
             "starts from the truth, as the tracker did."
         )
-    lines += [f"Note: {note}." for note in summary.notes]
     if summary.without_truth:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:
         lines.append(f"Without results: {listed(summary.without_results)}.")
+    lines += [f"Note: {note}." for note in summary.notes]
     return "\n".join([*lines, f"Next: lae-sim replay {out}"])
 
 

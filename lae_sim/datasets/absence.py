@@ -1,10 +1,10 @@
 """Flags of absence: the frames in which a dataset says that its target is not to be seen.
 
 Known are those of LaSOT (``full_occlusion.txt``, ``out_of_view.txt``; in its evaluation toolkit
-``absent/<seq>.txt``), of GOT-10k (``absence.label``, ``cover.label``), of VOT's long-term and depth
-challenges (``full-occlusion.tag``, ``out-of-frame.tag``; its ``occlusion.tag`` may be of a part of
-the target, and does not count) and of AVisT (``full_occlusion/<seq>_full_occlusion.txt``,
-``out_of_view/<seq>_out_of_view.txt``).
+``absent/<seq>.txt``), of GOT-10k (``absence.label``, ``cover.label``), of NfS (in its truth), of
+AVisT (``full_occlusion/<seq>_full_occlusion.txt``, ``out_of_view/<seq>_out_of_view.txt``) and of
+VOT's long-term and depth challenges (``full-occlusion.tag``, ``out-of-frame.tag``, and not
+``occlusion.tag``, which may be of a part of the target).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Bools
+from lae_sim.datasets.annotations import read_lost
 from lae_sim.datasets.numbers import read_numbers
 from lae_sim.errors import LaeError
 
@@ -63,14 +64,13 @@ def read_visible(truth: Path, frames: int) -> tuple[Bools | None, str | None]:
         False where the target is absent or fully covered, bool [frames], or None where nothing
         (valid) is said; and what is wrong, if anything is.
     """
-    files = absence_files(truth)
-    visible = np.ones(frames, np.bool_)
     try:
-        for path, rule in files.items():
-            visible &= ~_absent(path, rule, frames)
+        absent = [_absent(path, rule, frames) for path, rule in absence_files(truth).items()]
+        lost = read_lost(truth, frames)
     except LaeError as error:
         return None, f"flags of absence are left out: {error}"
-    return (visible if files else None), None
+    absent += [] if lost is None else [lost]
+    return (~np.logical_or.reduce(absent) if absent else None), None
 
 
 def _absent(path: Path, rule: _Rule, frames: int) -> Bools:

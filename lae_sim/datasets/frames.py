@@ -60,13 +60,13 @@ class Dataset:
         name: the dataset's name, such as ``"DTB70"``.
         fps: its frame rate, frames per second, exact.
         sequences: sorted by name.
-        notes: what of it was left out, a sentence each.
+        notes: which files beside the images and the truth could not be read, and why.
     """
 
     name: str
     fps: Fraction
     sequences: Sequence[ImageSequence]
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
 
     def __repr__(self) -> str:
         return f"<Dataset {self.name!r}: {len(self.sequences)} sequences at {self.fps} fps>"

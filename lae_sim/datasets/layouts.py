@@ -37,6 +37,7 @@ _BESIDE_ANNOTATIONS = (
     "data_seq/UAV123/{}",
     "data_seq/UAV123_10fps/{}",
     "data_seq/{}",
+    "frames/{}",
     "{}/img",
     "{}",
 )
@@ -74,7 +75,7 @@ def find_dataset(
         sequences: names of those wanted; all by default.
         box: the first box ``x, y, w, h`` in pixels, for images or a video without ground truth.
         fps: frames per second; by default the dataset's (30, or 10 for UAV123_10fps and GOT-10k)
-            or the video's own.
+            or the video's own. Of NfS it chooses the set, of 30 or 240.
 
     Returns:
         The dataset. Where only the first box is known, the truth after it is NaN.
@@ -108,21 +109,23 @@ def find_dataset(
     if root.is_file() or box is not None:
         return _without_truth(name, root, sequences, box, fps)
     name = _SPELLINGS.get((name or "").lower(), name)
-    truth = find_truth(root / "anno" / name if name and (root / "anno" / name).is_dir() else root)
+    named = root / "anno" / name if name else root
+    truth = find_truth(named if named.is_dir() else root, fps)
     if name is None:
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
     chosen_sequences = [
-        _sequence(root, sequence, truth.files[sequence], attributes.get(sequence, ()))
+        _sequence(root, sequence, truth.files[sequence], attributes.of.get(sequence, ()))
         for sequence in _choose(sequences, truth.files, str(root), truth.match)
     ]
-    notes = []
+    notes = [*attributes.notes]
     for i, sequence in enumerate(chosen_sequences):
         visible, note = read_visible(truth.files[sequence.name], len(sequence))
         chosen_sequences[i] = replace(sequence, visible=visible)
         notes += [f"sequence {sequence.name!r}: {note}"] if note else []
-    return Dataset(name, fps or Fraction(_FPS.get(name, 30)), chosen_sequences, tuple(notes))
+    fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
+    return Dataset(name, fps, chosen_sequences, notes)
 
 
 def _without_truth(
@@ -155,8 +158,8 @@ def _without_truth(
 
 
 def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) -> ImageSequence:
-    truth = read_truth(file)
     paths, first = _find_images(root, name, file)
+    truth = read_truth(file, len(paths))
     if len(truth) == 1:
         truth = _only_first(truth, len(paths))
     if len(paths) > len(truth):

@@ -107,7 +107,7 @@ def convert_results(
         truth: the dataset's folder (see :mod:`lae_sim.datasets.annotations`).
         format: a name of :data:`lae_sim.importers.results.FORMATS`, or ``"auto"``.
         fps: world frames per second, such as ``30`` or ``"30000/1001"``; by default 30, or 10 if
-            the dataset's name says ``10fps``.
+            the dataset's name says ``10fps``. Of NfS it chooses the set, of 30 or 240.
         time: where times come from (see :func:`lae_sim.importers.results.given_times`).
         time_unit: of measured times: ``"s"`` (the default), ``"ms"``, ``"us"`` or ``"ns"``.
         repetition: which run to take where the toolkit repeats them, from 1.
@@ -151,7 +151,8 @@ def convert_results(
     results = Path(results)
     kind, sources = find_results(results, format, repetition)
     other = {name: Path(path) for name, path in (truth_files or {}).items()}
-    annotations = find_truth(Path(truth)).with_files(other)
+    asked = None if fps is None else parse_fps(fps)
+    annotations = find_truth(Path(truth), asked).with_files(other)
     known, without_truth = _with_truth(kind, sources, annotations, skip_missing)
     absent = sorted({*sequences, *exclude, *other} - set(known))
     if absent:
@@ -160,7 +161,7 @@ def convert_results(
     if not matched:
         raise LaeError("--exclude leaves no sequence")
     dataset = dataset or annotations.dataset
-    rate = str(fps or ("10" if "10fps" in dataset.lower() else 30))
+    rate = str(fps or annotations.fps or ("10" if "10fps" in dataset.lower() else 30))
     clock = Clock.at(parse_fps(rate))
     tracker = tracker or tracker_name(kind, results, matched)
     given = given_times(time, tracker)
@@ -179,6 +180,7 @@ def convert_results(
     as_published = recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
     recordings, notes = _flagged(recordings, annotations)
+    attributes = read_attributes(annotations)
     metadata = Metadata.new(
         rate,
         **schedule,
@@ -186,7 +188,7 @@ def convert_results(
         device={"model": device} if device else {},
         dataset={"name": dataset},
         timing=timing,
-        sequences=_sequence_entries(matched, read_attributes(annotations), image_size),
+        sequences=_sequence_entries(matched, attributes.of, image_size),
     )
     left_out = {*matched, *exclude}
     elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
@@ -206,7 +208,7 @@ def convert_results(
         ],
         without_truth=without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
-        notes=notes,
+        notes=[*attributes.notes, *notes],
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
             *annotations.files.values(),
@@ -255,7 +257,7 @@ def _every_frame(
     measured = True
     for name, source in matched.items():
         results = read(source)
-        boxes = read_truth(truth.files[name])
+        boxes = read_truth(truth.files[name], len(results.boxes))
         elapsed = _elapsed(name, source, results, given)
         if len(results.boxes) != len(boxes):
             raise LaeError(

@@ -284,8 +284,6 @@ def run_profile(
         LaeError: as :func:`profile_tracker`.
     """
     dataset = find_dataset(plan.dataset, plan.root, plan.sequences, plan.box, plan.fps)
-    for note in dataset.notes:
-        notice(note)
     path = _trace_path(out, f"{plan.tracker}-{dataset.name}")
     check_folders([str(path)])
     unfinished = path.with_suffix(".unfinished")
@@ -296,6 +294,8 @@ def run_profile(
             "remove it to profile anew"
         )
         return Profile((), ())
+    for note in dataset.notes:
+        notice(f"note: {note}")
     failures: dict[str, list[Failure]] = {}
     interrupted = False
     with closing(_start(plan, notice)) as started:
