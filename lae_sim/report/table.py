@@ -14,6 +14,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from lae_sim.errors import visible
+from lae_sim.files import csv_cell
+
 Interval = tuple[float, float]
 
 
@@ -89,11 +92,6 @@ def relative_change(value: float | None, before: float | None) -> float | None:
     return None if value is None or not before else value / before - 1
 
 
-def printable(text: object) -> str:
-    """Text without line breaks and control characters, whatever a file holds."""
-    return "".join(c if c.isprintable() else " " for c in str(text))
-
-
 @dataclass(frozen=True)
 class Column:
     """A column: what of a record it shows, and how.
@@ -112,7 +110,7 @@ class Column:
 
     title: str
     value: str | Callable[[Any], Any]
-    form: Callable[..., str] = printable
+    form: Callable[..., str] = visible
     meaning: str = ""
     is_label: bool = False
     group: str = ""
@@ -212,6 +210,7 @@ def legend_of(table: Table) -> str:
 
 def aligned(header: Sequence[str], lines: Sequence[Sequence[str]], labels: int = 2) -> str:
     """Columns of text: the first ``labels`` to the left, the others to the right."""
+    header, lines = [*map(visible, header)], [[*map(visible, line)] for line in lines]
     widths = [max(map(len, column)) for column in zip(header, *lines)]
 
     def line(cells: Sequence[str]) -> str:
@@ -231,21 +230,21 @@ def write_csv(table: Table, path: Path) -> None:
     for column, wide in zip(table.columns, has_interval):
         title = f"{column.group} {column.name or column.title}".lstrip()
         header += [title, f"{title} low", f"{title} high"] if wide else [title]
-    with open(path, "w", newline="", encoding="utf-8") as file:
+    with open(path, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
+        writer.writerow(map(csv_cell, header))
         for row in table.rows:
             line: list[Any] = []
             for cell, wide in zip(row, has_interval):
                 line += [cell.value, *(cell.interval or (None, None))] if wide else [cell.value]
-            writer.writerow(line)
+            writer.writerow(map(csv_cell, line))
 
 
 def latex_of(table: Table) -> str:
     """A table in LaTeX, of the package booktabs."""
     labels, groups = table.labels, table.groups
     text = [
-        rf"% {printable(table.caption)}",
+        rf"% {visible(table.caption)}",
         r"% \usepackage{booktabs}; if it is too wide: \usepackage{adjustbox} and",
         rf"% \adjustbox{{max width=\linewidth}}{{\input{{{table.name}}}}}",
         rf"\begin{{tabular}}{{@{{}}{'l' * labels}{'r' * (len(table.columns) - labels)}@{{}}}}",
@@ -285,7 +284,7 @@ _TEX = {
 
 def tex(text: str) -> str:
     """Text for LaTeX: what is special there is escaped, and a minus is one."""
-    escaped = "".join(_TEX.get(c, c) for c in printable(text))
+    escaped = "".join(_TEX.get(c, c) for c in visible(text))
     return "--" if escaped == "-" else re.sub(r"(?<![\w.-])-(?=\d)", "$-$", escaped)
 
 

@@ -95,7 +95,7 @@ class Store:
     def keep(self, key: str, document: Any) -> None:
         """Keep a document under a key."""
         with written_whole(self._details(key)) as temporary:
-            temporary.write_text(json.dumps(document, allow_nan=False))
+            temporary.write_text(json.dumps(document, allow_nan=False), "utf-8")
 
     def rows(self, cell: Cell) -> Path:
         """The file of a cell's rows."""
@@ -111,7 +111,7 @@ class Store:
 
     def _read(self, path: Path) -> dict[str, Any]:
         try:
-            document: dict[str, Any] = json.loads(path.read_text())
+            document: dict[str, Any] = json.loads(path.read_text("utf-8"))
         except (OSError, ValueError) as error:
             raise LaeError(f"{path}: cannot be read: {error}; delete it") from error
         return document
