@@ -241,7 +241,11 @@ def write_csv(table: Table, path: Path) -> None:
 
 
 def latex_of(table: Table) -> str:
-    """A table in LaTeX, of the package booktabs."""
+    """A table in LaTeX, of the package booktabs.
+
+    Names are written as they are, in UTF-8, which LaTeX reads by default; where they have letters
+    for which pdflatex has no font, a comment says so.
+    """
     labels, groups = table.labels, table.groups
     text = [
         rf"% {visible(table.caption)}",
@@ -267,10 +271,19 @@ def latex_of(table: Table) -> str:
             text.append(r"\midrule")
         previous = row[0]
         text.append(" & ".join(cells) + r" \\")
+    if foreign := sorted({c for c in "".join(text) if not _has_font(c)}):
+        text.insert(1, f"% compile with lualatex or xelatex, and a font for {''.join(foreign)}")
     return "\n".join([*text, r"\bottomrule", r"\end{tabular}", ""])
 
 
+def _has_font(character: str) -> bool:
+    """Whether pdflatex can set a character: Latin 1 and 2, and some punctuation."""
+    return character < "\u0180" or "\u2013" <= character <= "\u2026"
+
+
 def _ranked(cell: Cell) -> str:
+    if cell == UNKNOWN:
+        return "--"
     marks = ("{}", r"\textbf{{{}}}", r"\underline{{{}}}")
     return marks[cell.rank].format(tex(cell.text))
 
@@ -278,14 +291,19 @@ def _ranked(cell: Cell) -> str:
 _TEX = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
     "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\char34{}",
-    "[": "{[}", "Δ": r"$\Delta$", "★": r"$\star$", **{c: "\\" + c for c in "&%$#_{}"},
+    "[": "{[}", "*": "{*}", "Δ": r"$\Delta$", "★": r"$\star$", **{c: "\\" + c for c in "&%$#_{}"},
 }  # fmt: skip
 
 
 def tex(text: str) -> str:
-    """Text for LaTeX: what is special there is escaped, and a minus is one."""
+    """Text for LaTeX: what is special there is escaped, and a minus is one.
+
+    So are a star and a bracket, which the end of the line above would take for its own, and no two
+    signs melt into one, as ``--`` and ``?`` with a grave accent would.
+    """
     escaped = "".join(_TEX.get(c, c) for c in visible(text))
-    return "--" if escaped == "-" else re.sub(r"(?<![\w.-])-(?=\d)", "$-$", escaped)
+    minus = re.sub(r"(?<![\w.-])-(?=\d)", "$-$", escaped)
+    return re.sub(r"(?<=[-'`,?!])(?=[-'`,])", "{}", minus)
 
 
 METRIC_LABELS = {

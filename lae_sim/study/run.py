@@ -214,14 +214,20 @@ def compute_study(
 
 
 def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathLike[str]]) -> None:
-    """Check that what a study writes, or takes away, is nothing that it reads.
+    """Check that what a study writes, or takes away, is nothing that it reads, and only files.
 
     Raises:
-        LaeError: if it is.
+        LaeError: if it is, or if a folder stands where a file is to be, or a file for a folder.
     """
     written = [Path(folder, f"{name}.csv") for name in ("summary", "comparisons", "required")]
     written += [Path(folder, "study.json"), Path(folder, "report.html")]
-    check_distinct([*written, *Path(folder, "tables").glob("*")], inputs)
+    tables = Path(folder, "tables")
+    for path in (*written, *tables.glob("*.csv"), *tables.glob("*.tex")):
+        if path.exists() and not path.is_file():
+            raise LaeError(f"{path}: is there already and is not a file: move it away")
+    if tables.exists() and not tables.is_dir():
+        raise LaeError(f"{tables}: is there already and is not a folder: move it away")
+    check_distinct([*written, *tables.glob("*")], inputs)
 
 
 def _run(
