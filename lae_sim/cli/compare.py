@@ -182,10 +182,12 @@ def _write(table: DataFrame, path: str) -> None:
 
     with written_whole(path) as temporary:
         if path.endswith(".csv"):
-            texts = table.select_dtypes(object).apply(lambda column: column.map(csv_cell))
-            table.assign(**texts).to_csv(temporary, index=False, encoding="utf-8")
+            texts = [name for name in table if table[name].dtype.kind == "O"]
+            quoted = {name: [*map(csv_cell, table[name])] for name in texts}
+            table.assign(**quoted).to_csv(temporary, index=False, encoding="utf-8")
         else:
-            table.to_parquet(temporary, index=False)
+            with open(temporary, "wb") as file:  # whose name need not be UTF-8
+                table.to_parquet(file, index=False)
 
 
 def _records(table: DataFrame) -> list[dict[str, Any]]:

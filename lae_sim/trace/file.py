@@ -199,8 +199,9 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
     check = RowChecker(str(path), metadata.profiled, restarts=metadata.kind == "restarts")
     with (
         written_whole(path) as temporary,
+        pa.OSFile(os.fsencode(temporary), "wb") as sink,  # whose name need not be UTF-8
         pq.ParquetWriter(
-            temporary,
+            sink,
             schema,
             compression="zstd",
             compression_level=1,
