@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import argument, exit_status, new_parser
-from lae_sim.errors import LaeError
+from lae_sim.cli.options import argument, exit_status, new_parser, print_json
+from lae_sim.errors import LaeError, listed
 from lae_sim.files import check_distinct
-from lae_sim.progress import ProgressBar
+from lae_sim.progress import ProgressBar, print_text
 
 if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary
@@ -41,7 +40,7 @@ examples:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim convert``; see ``--help``."""
     arguments = _parser().parse_args(argv)
-    return exit_status(lambda: _convert(arguments), "lae-sim convert")
+    return exit_status(lambda: _convert(arguments), "lae-sim convert", prints_result=False)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -125,15 +124,13 @@ def _convert(arguments: argparse.Namespace) -> None:
         check_replaces(arguments.out, summary.tracker, summary.dataset)
     write_trace(trace, arguments.out)
     if arguments.json:
-        print(json.dumps(summary.document(arguments.out), indent=2))
+        print_json(summary.document(arguments.out))
     else:
-        print(_text(summary, arguments.out))
+        print_text(_text(summary, arguments.out))
 
 
 def _text(summary: ConversionSummary, out: Path) -> str:
     """The summary for people."""
-    from lae_sim.importers.convert import listed
-
     processed = "every frame"
     if summary.schedule == "real-time":
         processed = f"in real time, {summary.processed:,} processed"

@@ -14,7 +14,7 @@ from lae_sim._arrays import Ints
 from lae_sim.datasets.absence import absence_files, read_visible
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
 from lae_sim.engine.clock import Clock, Number, parse_fps
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, listed, shown
 from lae_sim.importers.coordinates import other_reading, row_0_is_off
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.importers.results import (
@@ -136,7 +136,7 @@ def convert_results(
         ...     for name in ("results", "anno"):
         ...         pathlib.Path(folder, name).mkdir()
         ...         boxes = "1,2,30,40" if name == "anno" else "3,2,30,40"
-        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes)
+        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes, "utf-8")
         ...     trace, summary = lae_sim.convert_results(
         ...         f"{folder}/results", f"{folder}/anno", time="constant:47ms"
         ...     )
@@ -390,9 +390,3 @@ def _sequence_entries(
         }
         entries[name] = {key: value for key, value in entry.items() if value}
     return entries
-
-
-def listed(names: Sequence[str], most: int = 5) -> str:
-    """Some names, at most so many of them, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
