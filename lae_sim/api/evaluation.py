@@ -27,7 +27,7 @@ from lae_sim.api.inputs import (
 from lae_sim.boxes import iou
 from lae_sim.engine.clock import Number, exact
 from lae_sim.engine.scheduler import Policy
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, hint, listed, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
@@ -414,7 +414,7 @@ class EvaluationResult:
         if trace is None and len(named) == 1:
             return next(iter(named.values()))
         if trace not in named:
-            raise LaeError(f"trace: name one of {', '.join(reversed(named))}")
+            raise LaeError(f"trace: name one of {listed(reversed(named))}")
         return named[trace]
 
     def __repr__(self) -> str:

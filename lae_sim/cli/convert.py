@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser
-from lae_sim.errors import LaeError
+from lae_sim.cli.options import (
+    add_frame_times,
+    argument,
+    exit_status,
+    new_parser,
+    print_json,
+)
+from lae_sim.errors import LaeError, listed
 from lae_sim.files import check_distinct
-from lae_sim.progress import ProgressBar
+from lae_sim.progress import ProgressBar, print_text
 
 if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary
@@ -41,7 +46,7 @@ examples:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim convert``; see ``--help``."""
     arguments = _parser().parse_args(argv)
-    return exit_status(lambda: _convert(arguments), "lae-sim convert")
+    return exit_status(lambda: _convert(arguments), "lae-sim convert", prints_result=False)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -127,15 +132,14 @@ def _convert(arguments: argparse.Namespace) -> None:
         check_replaces(arguments.out, summary.tracker, summary.dataset)
     write_trace(trace, arguments.out)
     if arguments.json:
-        print(json.dumps(summary.document(arguments.out), indent=2))
+        print_json(summary.document(arguments.out))
     else:
-        print(_text(summary, arguments.out))
+        print_text(_text(summary, arguments.out))
 
 
 def _text(summary: ConversionSummary, out: Path) -> str:
     """The summary for people."""
     from lae_sim.datasets.dropped import note
-    from lae_sim.importers.convert import listed
 
     processed = "every frame"
     if summary.schedule == "real-time":
@@ -157,7 +161,7 @@ def _text(summary: ConversionSummary, out: Path) -> str:
             f"{summary.sequences} sequences ({listed(summary.row_0_from_truth)}); there the trace "
             "starts from the truth, as the tracker did."
         )
-    lines += [f"Note: {note}." for note in summary.notes]
+    lines += [f"Note: {each}." for each in summary.notes]
     if summary.without_truth:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:

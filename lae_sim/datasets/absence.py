@@ -1,10 +1,10 @@
 """Flags of absence: the frames in which a dataset says that its target is not to be seen.
 
 Known are those of LaSOT (``full_occlusion.txt``, ``out_of_view.txt``; in its evaluation toolkit
-``absent/<seq>.txt``), of GOT-10k (``absence.label``, ``cover.label``), of VOT's long-term and depth
-challenges (``full-occlusion.tag``, ``out-of-frame.tag``; its ``occlusion.tag`` may be of a part of
-the target, and does not count), of AVisT (``full_occlusion/<seq>_full_occlusion.txt``,
-``out_of_view/<seq>_out_of_view.txt``), and of NfS, whose rows say where the target is lost.
+``absent/<seq>.txt``), of GOT-10k (``absence.label``, ``cover.label``), of NfS (in its truth), of
+AVisT (``full_occlusion/<seq>_full_occlusion.txt``, ``out_of_view/<seq>_out_of_view.txt``) and of
+VOT's long-term and depth challenges (``full-occlusion.tag``, ``out-of-frame.tag``, and not
+``occlusion.tag``, which may be of a part of the target).
 """
 
 from __future__ import annotations
@@ -64,17 +64,13 @@ def read_visible(truth: Path, frames: int) -> tuple[Bools | None, str | None]:
         False where the target is absent or fully covered, bool [frames], or None where nothing
         (valid) is said; and what is wrong, if anything is.
     """
-    files = absence_files(truth)
-    visible = np.ones(frames, np.bool_)
     try:
-        for path, rule in files.items():
-            visible &= ~_absent(path, rule, frames)
-        lost = read_lost(truth, frames) if truth.is_file() else None
-        if lost is not None:
-            visible &= ~lost
+        absent = [_absent(path, rule, frames) for path, rule in absence_files(truth).items()]
+        lost = read_lost(truth, frames)
     except LaeError as error:
         return None, f"flags of absence are left out: {error}"
-    return (visible if files or lost is not None else None), None
+    absent += [] if lost is None else [lost]
+    return (~np.logical_or.reduce(absent) if absent else None), None
 
 
 def _absent(path: Path, rule: _Rule, frames: int) -> Bools:

@@ -23,7 +23,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats
 from lae_sim.datasets.foreign import HEAD_BYTES, foreign, foreign_columns
 from lae_sim.datasets.numbers import read_lines, read_numbers
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed
 
 _PER_SEQUENCE = re.compile(r"groundtruth(?:_rect)?(?:\.([0-9]))?\.txt\Z")
 _NOT_SEQUENCES = ("readme", "list", "license")
@@ -457,7 +457,7 @@ def _annotation_folder(root: Path) -> Path:
             return inner[root.resolve().name]
         if len(inner) > 1:
             raise LaeError(
-                f"{folder}: holds the ground truth of {', '.join(inner)}; give one of them, "
+                f"{folder}: holds the ground truth of {listed(inner)}; give one of them, "
                 f"such as {next(iter(inner.values()))}"
             )
         if inner:

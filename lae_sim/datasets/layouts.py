@@ -25,7 +25,7 @@ from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, image_num
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.synthetic import synthetic_dataset
 from lae_sim.engine.clock import Number, parse_fps
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, listed, shown
 from lae_sim.files import sequence_names
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -315,7 +315,7 @@ def _choose(
         if matching is None:
             close = difflib.get_close_matches(name, names) or names[:3]
             raise LaeError(
-                f"{where}: no sequence {name!r} among {len(names)}; there is {', '.join(close)}"
+                f"{where}: no sequence {shown(name)} among {len(names)}; there is {listed(close)}"
             )
         chosen.add(matching)
     return [name for name in names if not wanted or name in chosen]

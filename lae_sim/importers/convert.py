@@ -17,7 +17,7 @@ from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attribute
 from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing
 from lae_sim.datasets.layouts import image_numbers
 from lae_sim.engine.clock import Clock, Number, parse_fps
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, listed, shown
 from lae_sim.importers.coordinates import other_reading, row_0_is_off
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.importers.results import (
@@ -147,7 +147,7 @@ def convert_results(
         ...     for name in ("results", "anno"):
         ...         pathlib.Path(folder, name).mkdir()
         ...         boxes = "1,2,30,40" if name == "anno" else "3,2,30,40"
-        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes)
+        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes, "utf-8")
         ...     trace, summary = lae_sim.convert_results(
         ...         f"{folder}/results", f"{folder}/anno", time="constant:47ms"
         ...     )
@@ -230,7 +230,7 @@ def convert_results(
         ],
         without_truth=without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
-        notes=[*notes, *attributes.notes],
+        notes=[*attributes.notes, *notes],
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
             *annotations.files.values(),
@@ -436,9 +436,3 @@ def _sequence_entries(
         }
         entries[name] = {key: value for key, value in entry.items() if value}
     return entries
-
-
-def listed(names: Sequence[str], most: int = 5) -> str:
-    """Some names, at most so many of them, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -288,8 +288,6 @@ def run_profile(
     dataset = find_dataset(
         plan.dataset, plan.root, plan.sequences, plan.box, plan.fps, plan.frame_times
     )
-    for note in dataset.notes:
-        notice(note)
     path = _trace_path(out, f"{plan.tracker}-{dataset.name}")
     check_folders([str(path)])
     unfinished = path.with_suffix(".unfinished")

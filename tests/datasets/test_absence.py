@@ -9,11 +9,12 @@ import pytest
 from lae_sim.datasets.absence import absence_files, read_visible
 
 FRAMES = 6
+BOXES = "1,2,3,4\n" * FRAMES
 
 
 def written(folder: Path, files: dict[str, str]) -> Path:
-    """The file of ground truth (an own one where it is flat) with others beside it."""
-    for name, text in files.items():
+    """A file of ground truth with others beside it."""
+    for name, text in {"groundtruth.txt": BOXES, **files}.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
     return folder / "groundtruth.txt"
@@ -50,17 +51,28 @@ def test_flags_beside_the_truth(tmp_path: Path, files: dict[str, str], expected:
 
 
 def test_flags_of_flat_files(tmp_path: Path) -> None:
-    written(tmp_path, {"annos/absent/bird-2.txt": "0\n0\n1\n0\n0\n1\n"})
+    written(tmp_path, {"annos/absent/bird-2.txt": "0\n0\n1\n0\n0\n1\n", "annos/bird-2.txt": BOXES})
     assert absent(tmp_path / "annos" / "bird-2.txt") == [2, 5]
     written(
         tmp_path,
         {
             "full_occlusion/fog_full_occlusion.txt": "1\n0\n0\n0\n0\n0\n",
             "out_of_view/fog_out_of_view.txt": "0\n0\n0\n0\n0\n1\n",
+            "anno/fog.txt": BOXES,
         },
     )
-    (tmp_path / "anno").mkdir()
     assert absent(tmp_path / "anno" / "fog.txt") == [0, 5]
+
+
+@pytest.mark.parametrize(("step", "frames"), [(1, 24), (8, 3)])
+def test_nfs_says_in_its_truth_where_the_target_is_out_of_view(
+    tmp_path: Path, step: int, frames: int
+) -> None:
+    """Of 30 frames/s every eighth row counts. An occluded target may be seen in part."""
+    rows = [f'0 5 5 30 40 {i} {int(i in (8, 9))} {int(i == 3)} 0 "ball"\n' for i in range(24)]
+    rate = {1: "240", 8: "30"}[step]
+    written(tmp_path, {f"ball/{rate}/ball.txt": "".join(rows)})
+    assert absent(tmp_path / "ball" / rate / "ball.txt", frames) == ([8, 9] if step == 1 else [1])
 
 
 @pytest.mark.parametrize(
