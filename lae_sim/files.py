@@ -7,9 +7,11 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, shown, visible
 
 
 @contextmanager
@@ -105,9 +107,25 @@ def text_digest(text: str) -> str:
 
 
 def labels(paths: Sequence[str]) -> list[str]:
-    """File names, where they tell the files apart; otherwise the paths."""
-    names = [Path(path).name for path in paths]
-    return names if len(set(names)) == len(names) else list(paths)
+    """File names, where they tell the files apart; otherwise the paths. All can be printed."""
+    names = [visible(Path(path).name) for path in paths]
+    return names if len(set(names)) == len(names) else [visible(path) for path in paths]
+
+
+def csv_cell(value: Any) -> Any:
+    """A value as a cell of a CSV file, of which no spreadsheet makes a formula.
+
+    A text that begins with one of ``= + - @ '``, a tab or a line break has an apostrophe before it
+    (a recipe of OWASP, "CSV Injection"), unless it is a number; one apostrophe taken from the front
+    of a cell gives the text back. All other values stay what they are.
+    """
+    if not isinstance(value, str) or not value.startswith(("=", "+", "-", "@", "'", *"\t\r\n")):
+        return value
+    try:
+        Fraction(value)
+    except (ValueError, ZeroDivisionError):
+        return f"'{value}"
+    return value
 
 
 def sequence_names(sequences: str | Iterable[str]) -> list[str]:

@@ -27,7 +27,7 @@ from lae_sim.api.inputs import (
 from lae_sim.boxes import iou
 from lae_sim.engine.clock import Number, exact
 from lae_sim.engine.scheduler import Policy
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, hint, listed, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
@@ -359,7 +359,7 @@ class EvaluationResult:
         Returns:
             A row per world frame: ``frame``; the answer ``x, y, w, h`` in pixels; ``source_frame``,
             the frame of the output that it comes from; the truth ``truth_x`` to ``truth_h``; the
-            ``iou`` of the two.
+            ``iou`` of the two; ``visible``, where the trace says whether the target is.
 
         Raises:
             LaeError: if there is no such trace, sequence, forecaster or permitted latency.
@@ -386,7 +386,7 @@ class EvaluationResult:
             chosen,
             scenario.costs.get(forecaster, 0),
         )
-        truth = run.recording.truth
+        truth, visible = run.recording.truth, run.recording.visible
         return pd.DataFrame(
             {
                 "frame": np.arange(len(run)),
@@ -394,6 +394,7 @@ class EvaluationResult:
                 "source_frame": found.source_frame,
                 **dict(zip(("truth_x", "truth_y", "truth_w", "truth_h"), truth.T)),
                 "iou": iou(found.boxes, truth),
+                **({} if visible is None else {"visible": visible}),
             }
         )
 
@@ -413,7 +414,7 @@ class EvaluationResult:
         if trace is None and len(named) == 1:
             return next(iter(named.values()))
         if trace not in named:
-            raise LaeError(f"trace: name one of {', '.join(reversed(named))}")
+            raise LaeError(f"trace: name one of {listed(reversed(named))}")
         return named[trace]
 
     def __repr__(self) -> str:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser
-from lae_sim.errors import LaeError
+from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser, print_json
+from lae_sim.errors import LaeError, listed
 from lae_sim.files import check_distinct
-from lae_sim.progress import ProgressBar
+from lae_sim.progress import ProgressBar, print_text
 
 if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary
@@ -41,7 +40,7 @@ examples:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim convert``; see ``--help``."""
     arguments = _parser().parse_args(argv)
-    return exit_status(lambda: _convert(arguments), "lae-sim convert")
+    return exit_status(lambda: _convert(arguments), "lae-sim convert", prints_result=False)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -58,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--fps",
         help="world frames per second, such as 29.97 or 30000/1001 (default: 30, or 10 if the "
-        "dataset's name says 10fps)",
+        "dataset's name says 10fps); of NfS, the set: 30 or 240",
     )
     add(
         "--time",
@@ -127,16 +126,13 @@ def _convert(arguments: argparse.Namespace) -> None:
         check_replaces(arguments.out, summary.tracker, summary.dataset)
     write_trace(trace, arguments.out)
     if arguments.json:
-        print(json.dumps(summary.document(arguments.out), indent=2))
+        print_json(summary.document(arguments.out))
     else:
-        print(_text(summary, arguments.out))
+        print_text(_text(summary, arguments.out))
 
 
 def _text(summary: ConversionSummary, out: Path) -> str:
     """The summary for people."""
-    from lae_sim.datasets.dropped import note
-    from lae_sim.importers.convert import listed
-
     processed = "every frame"
     if summary.schedule == "real-time":
         processed = f"in real time, {summary.processed:,} processed"
@@ -148,9 +144,6 @@ def _text(summary: ConversionSummary, out: Path) -> str:
     ]
     if "note" in summary.timing:
         lines.append(f"Note: {summary.timing['note']}.")
-    if summary.frame_times:
-        said = note(summary.numbers_missing, summary.frame_times)
-        lines.append(f"{said[0].upper()}{said[1:]}.")
     if summary.row_0_from_truth:
         lines.append(
             f"Row 0 is not the initial box in {len(summary.row_0_from_truth)} of "
@@ -161,6 +154,7 @@ def _text(summary: ConversionSummary, out: Path) -> str:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:
         lines.append(f"Without results: {listed(summary.without_results)}.")
+    lines += [f"Note: {note}." for note in summary.notes]
     return "\n".join([*lines, f"Next: lae-sim replay {out}"])
 
 

@@ -6,14 +6,15 @@ import argparse
 import os
 import select
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from itertools import product
-from typing import TYPE_CHECKING, Any, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
 from lae_sim.engine.clock import parse_fps, parse_rational, whole
-from lae_sim.errors import LaeError
-from lae_sim.progress import tell
+from lae_sim.errors import LaeError, abridged, visible
+from lae_sim.progress import OutputError, print_text, printing, tell
 
 if TYPE_CHECKING:
     from lae_sim.replay.world import World
@@ -198,9 +199,17 @@ def argument(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     return parsed
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are as short as those of the work."""
+
+    def error(self, message: str) -> NoReturn:
+        tell(f"{self.prog}: error: {abridged(visible(message))} ({self.prog} --help says more)")
+        self.exit(2)
+
+
 def new_parser(program: str, description: str, examples: str) -> argparse.ArgumentParser:
     """A command line's parser, whose help ends with examples."""
-    return argparse.ArgumentParser(
+    return _Parser(
         prog=program,
         description=description,
         epilog=examples,
@@ -208,27 +217,53 @@ def new_parser(program: str, description: str, examples: str) -> argparse.Argume
     )
 
 
-def exit_status(work: Callable[[], None], program: str) -> int:
+def exit_status(work: Callable[[], None], program: str, prints_result: bool = True) -> int:
     """Do the work of a command; its exit status is 0, 2 for an error, 130 for Ctrl-C.
 
     An error is one or two lines on the standard error stream, without a traceback. Work prints when
     it has written its files: that nobody reads what it prints is no error.
+
+    Args:
+        work: reads, computes, writes and prints.
+        program: what its messages begin with.
+        prints_result: whether what it prints is the result, and lost if it cannot be printed; and
+            not only words about files.
     """
     _occupy_closed_streams()
     try:
         work()
         if sys.stdout is not None:
-            sys.stdout.flush()
+            with printing():
+                sys.stdout.flush()
     except KeyboardInterrupt:
         tell(f"{program}: interrupted")
         return 130
     except (LaeError, OSError) as error:
         if isinstance(error, BrokenPipeError) and _reader_gone(sys.stdout):  # such as head
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _forget_output()
             return 0
-        tell(f"{program}: error: {error}")
+        if isinstance(error, OutputError):
+            _forget_output()
+            lost = "the result is lost" if prints_result else "the files are written"
+            tell(f"{program}: {'error: ' * prints_result}{error}: {lost}")
+            return 2 * prints_result
+        tell(f"{program}: error: {abridged(visible(error))}")
         return 2
     return 0
+
+
+def _forget_output() -> None:
+    """Let what is still to be printed go nowhere, or Python would try it again at its end."""
+    with suppress(OSError):  # a standard output that is no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """Print a document as strict JSON, in letters that every terminal has."""
+    import json
+
+    text = json.dumps(document, indent=2, allow_nan=False)
+    print_text(text.replace("\x7f", "\\u007f"))  # which JSON, but no terminal, takes for a letter
 
 
 def _occupy_closed_streams() -> None:

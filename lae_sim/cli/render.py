@@ -69,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 2 for bad input."""
     arguments = parser().parse_args(argv)
-    return exit_status(lambda: _render(arguments), PROGRAM)
+    return exit_status(lambda: _render(arguments), PROGRAM, prints_result=False)
 
 
 def _render(arguments: argparse.Namespace) -> None:

@@ -3,29 +3,76 @@
 Known layouts: OTB100 and DTB70 (``<seq>/groundtruth_rect.txt``), GOT-10k, VOT and LaSOT
 (``<seq>/groundtruth.txt``, also in the folders of GOT-10k's splits, of LaSOT's classes and of a
 VOT workspace), UAVDT (``anno/<seq>_gt.txt``), UAV123, UAV123_10fps and UAV20L
-(``anno/<dataset>/<seq>.txt``), VisDrone-SOT (``annotations/<seq>.txt``), and any folder of
-``<seq>.txt``.
+(``anno/<dataset>/<seq>.txt``), VisDrone-SOT (``annotations/<seq>.txt``), NfS as it is downloaded
+(``<seq>/<frames per second>/<seq>.txt``), and any folder of ``<seq>.txt``.
 """
 
 from __future__ import annotations
 
 import csv
+import itertools
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from math import gcd
 from pathlib import Path
 
 import numpy as np
 
-from lae_sim._arrays import Floats
-from lae_sim.datasets.numbers import read_numbers
-from lae_sim.errors import LaeError
+from lae_sim._arrays import Bools, Floats
+from lae_sim.datasets.foreign import HEAD_BYTES, foreign, foreign_columns
+from lae_sim.datasets.numbers import read_lines, read_numbers
+from lae_sim.errors import LaeError, listed
 
 _PER_SEQUENCE = re.compile(r"groundtruth(?:_rect)?(?:\.([0-9]))?\.txt\Z")
 _NOT_SEQUENCES = ("readme", "list", "license")
 _ANNOTATION_FOLDERS = ("annotations", "anno")
 _ATTRIBUTE_FOLDERS = ("att", "attributes")
+_NFS_RATES = ("30", "240")
+_NFS_THINNED = 8  # the truth of its 30 frames/s is that of 240
+# A row of VATIC, from which NfS is (https://github.com/cvondrick/vatic): track, corners, frame,
+# lost (outside of the view), occluded, generated (interpolated), label.
+_VATIC = re.compile(
+    r"([0-9]{1,9})"
+    + r"\s+(-?[0-9]{1,9}(?:\.[0-9]{0,9})?)" * 4
+    + r"\s+([0-9]{1,9})"
+    + r"\s+([01])" * 3
+    + r'\s+"'
+)
+_MOST_GAPS = 100
+# What may be in place of ground truth, and is worth a look at how it begins.
+_CONTAINERS = (
+    ".json",
+    ".xml",
+    ".zip",
+    ".tar",
+    ".gz",
+    ".tgz",
+    ".7z",
+    ".rar",
+    ".txt",
+    ".html",
+    ".mat",
+)
+_MOST_LOOKED_AT = 2000
 
+# The first ten are named so by the toolkit's experiments/perfPlot.m, and the paper (Li and Yeung,
+# "Visual Object Tracking for Unmanned Aerial Vehicles", 2017) has motion blur besides
+# (https://github.com/flyers/drone-tracking).
+_DTB70 = (
+    "Scale variation",
+    "Aspect ratio variation",
+    "Occlusion",
+    "Deformation",
+    "Fast camera motion",
+    "In-plane rotation",
+    "Out-of-plane rotation",
+    "Out-of-view",
+    "Background clutter",
+    "Similar objects around",
+    "Motion blur",
+)
 _UAV123 = (
     "Scale variation",
     "Aspect ratio change",
@@ -65,7 +112,7 @@ _VISDRONE = (
     "Scale Variation",
     "Viewpoint Change",
 )
-_ATTRIBUTES_BY_SUFFIX = {"_att": _UAVDT, "_attr": _VISDRONE, "": _UAV123}
+_ATTRIBUTES_BY_SUFFIX = {"_att": (_UAVDT,), "_attr": (_VISDRONE,), "": (_UAV123, _DTB70)}
 
 
 @dataclass(frozen=True)
@@ -76,11 +123,13 @@ class GroundTruth:
         root: the folder (or the file) that was given.
         dataset: the dataset's name, as its folder is called.
         files: the annotation file of each sequence, sorted by name.
+        fps: frames per second, if the layout says so.
     """
 
     root: Path
     dataset: str
     files: Mapping[str, Path]
+    fps: Fraction | None = None
 
     def with_files(self, files: Mapping[str, Path]) -> GroundTruth:
         """The same with other files for some sequences."""
@@ -110,11 +159,25 @@ class GroundTruth:
         return alike[0] if len(alike) == 1 else None
 
 
-def find_truth(root: Path) -> GroundTruth:
+@dataclass(frozen=True)
+class Attributes:
+    """A dataset's attributes, as far as they could be read.
+
+    Attributes:
+        of: those of each sequence, such as ``"Occlusion"``; empty if the dataset has none.
+        notes: which files were left out, and why.
+    """
+
+    of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def find_truth(root: Path, fps: Fraction | None = None) -> GroundTruth:
     """Find the annotation files of a dataset.
 
     Args:
         root: the dataset's folder, its folder of annotations, or one annotation file.
+        fps: frames per second, to choose between sets that differ in it (NfS).
 
     Raises:
         LaeError: if nothing is found, or there is more than one set of annotations.
@@ -122,28 +185,49 @@ def find_truth(root: Path) -> GroundTruth:
     if root.is_file():
         folder = root.resolve().parent
         named = _PER_SEQUENCE.match(root.name)
-        return GroundTruth(root, "unknown", {folder.name if named else root.stem: root})
+        name = folder.name if named else root.stem
+        return GroundTruth(root, "unknown", {name: root}, _rate(root))
     if not root.is_dir():
         raise LaeError(f"{root}: no such folder; give the dataset's folder")
-    files = _in_sequence_folders(root) or _flat(_annotation_folder(root))
+    files = _in_sequence_folders(root) or _nfs(root, fps) or _flat(_annotation_folder(root))
     if not files:
         raise LaeError(
-            f"{root}: no ground truth found; looked for <seq>/groundtruth_rect.txt, anno/<seq>.txt,"
-            " anno/<dataset>/<seq>.txt, annotations/<seq>.txt and <seq>.txt"
+            f"{root}: no ground truth found; "
+            + (
+                _instead(root)
+                or "looked for <seq>/groundtruth_rect.txt, anno/<seq>.txt, "
+                "anno/<dataset>/<seq>.txt, annotations/<seq>.txt and <seq>.txt"
+            )
         )
-    return GroundTruth(root, _dataset(next(iter(files.values()))), dict(sorted(files.items())))
+    first = next(iter(files.values()))
+    return GroundTruth(root, _dataset(first), dict(sorted(files.items())), _rate(first))
 
 
-def read_truth(path: Path) -> Floats:
+def read_truth(path: Path, frames: int | None = None) -> Floats:
     """Ground truth boxes ``x, y, w, h`` in pixels, float64 [T, 4]; a row of NaN = none.
 
-    Polygons of four corners (8 columns) become the axis-aligned boxes around them.
+    Polygons of four corners (8 columns) become the axis-aligned boxes around them. A row that is 0
+    or NaN only is none (VOT). Rows of VATIC, from corner to corner, are read too (NfS); those of
+    NfS's 30 frames/s are every eighth.
+
+    Args:
+        path: the annotation file.
+        frames: how many the sequence has, if known: how NfS is thinned out, or ends a frame early
+            or late, shows only beside it.
 
     Raises:
-        LaeError: if the file has neither 4 nor 8 columns, or a row is NaN in part.
+        LaeError: if the file has neither 4 nor 8 columns, or looks like another format: it says
+            which; or if a row is NaN in part.
     """
-    table = read_numbers(path, nan=True)
+    lines = read_lines(path)
+    if _VATIC.match(lines[0]):
+        boxes, _ = read_vatic(path, lines)
+        return boxes if frames is None else _of_frames(boxes, frames, path)
+    table = read_numbers(path, nan=True, absent=True, lines=lines)
     columns = table.shape[1]
+    other = foreign_columns(table)
+    if other is not None:
+        raise LaeError(f"{path}: {other}")
     if columns not in (4, 8):
         raise LaeError(f"{path}: {columns} columns; ground truth has 4 (x, y, w, h) or 8 (corners)")
     unknown = np.isnan(table)
@@ -159,14 +243,66 @@ def read_truth(path: Path) -> Floats:
     return np.concatenate([least, most - least], axis=1)
 
 
-def read_attributes(truth: GroundTruth) -> dict[str, tuple[str, ...]]:
-    """The dataset's attributes of each sequence, such as ``"Occlusion"``; empty if it has none.
+def read_vatic(path: Path, lines: Sequence[str]) -> tuple[Floats, Bools]:
+    """One target that was annotated with VATIC.
 
-    They come from ``attributes.csv`` (``sequence,Attribute 1,...`` with flags 0 or 1) beside the
-    annotations, or from the official folders ``att`` and ``attributes``.
+    Returns:
+        Boxes ``x, y, w, h`` in pixels, float64 [T, 4], a row of NaN = none; and whether the target
+        is lost there, out of view, bool [T].
 
     Raises:
-        LaeError: if a file of attributes is damaged.
+        LaeError: if a row is another, or of another target, or frames are there twice.
+    """
+    rows = []
+    for number, line in enumerate(lines, 1):
+        match = _VATIC.match(line)
+        if match is None:
+            raise LaeError(
+                f"{path}, line {number}: not a row of VATIC as line 1 is: id xmin ymin xmax ymax "
+                'frame lost occluded generated "label"'
+            )
+        rows.append([float(cell) for cell in match.groups()])
+        if rows[-1][0] != rows[0][0]:
+            raise LaeError(
+                f"{path}, line {number}: another target (id {match[1]}); keep the rows of one"
+            )
+        if number > 1 and rows[-1][5] <= rows[-2][5]:
+            raise LaeError(f"{path}, line {number}: frame {match[6]} is there twice, or too late")
+    table = np.array(rows)
+    at = (table[:, 5] - table[0, 5]).astype(np.int64)
+    at //= gcd(*at.tolist()) or 1
+    if at[-1] > _MOST_GAPS * len(at):
+        raise LaeError(f"{path}: frames up to {table[-1, 5]:.0f}, of which it has {len(at)}")
+    boxes, lost = np.full((at[-1] + 1, 4), np.nan), np.zeros(at[-1] + 1, bool)
+    boxes[at] = np.concatenate([table[:, 1:3], table[:, 3:5] - table[:, 1:3]], axis=1)
+    lost[at] = table[:, 6] == 1
+    return boxes, lost
+
+
+def read_lost(path: Path, frames: int) -> Bools | None:
+    """Whether the target is out of view, bool [frames], if that stands with the ground truth.
+
+    Args:
+        path: the annotation file.
+        frames: how many the sequence has.
+
+    Raises:
+        LaeError: as :func:`read_truth`.
+    """
+    lines = read_lines(path)
+    if not _VATIC.match(lines[0]):
+        return None
+    _, lost = read_vatic(path, lines)
+    flags: Bools = _of_frames(np.tile(lost[:, None], 4).astype(np.float64), frames, path)[:, 0] == 1
+    return flags
+
+
+def read_attributes(truth: GroundTruth) -> Attributes:
+    """The dataset's attributes of each sequence.
+
+    They come from ``attributes.csv`` (``sequence,Attribute 1,...`` with flags 0 or 1) beside the
+    annotations, or from the official folders ``att`` and ``attributes``. A file that is damaged, or
+    of another number of flags than is known, is left out with a note: nothing depends on it.
     """
     anchors = dict.fromkeys(
         anchor
@@ -175,17 +311,27 @@ def read_attributes(truth: GroundTruth) -> dict[str, tuple[str, ...]]:
     )
     for anchor in anchors:
         if (anchor / "attributes.csv").is_file():
-            return _from_csv(anchor / "attributes.csv", truth.files)
-    attributes = {}
+            try:
+                return Attributes(_from_csv(anchor / "attributes.csv", truth.files))
+            except LaeError as error:
+                return Attributes(notes=(f"attributes are left out: {error}",))
+    attributes: dict[str, tuple[str, ...]] = {}
+    damaged: dict[str, LaeError] = {}
     folders = [anchor / name for anchor in anchors for name in _ATTRIBUTE_FOLDERS]
     folders = [folder for folder in folders if folder.is_dir()]
-    for sequence in truth.files:
-        for folder in folders:
-            for suffix, names in _ATTRIBUTES_BY_SUFFIX.items():
-                path = folder / f"{sequence}{suffix}.txt"
-                if sequence not in attributes and path.is_file():
-                    attributes[sequence] = _from_flags(path, names)
-    return attributes
+    for sequence, folder in itertools.product(truth.files, folders):
+        for suffix, known in _ATTRIBUTES_BY_SUFFIX.items():
+            path = folder / f"{sequence}{suffix}.txt"
+            if sequence not in attributes and path.is_file():
+                try:
+                    attributes[sequence] = _from_flags(path, known)
+                except LaeError as error:
+                    damaged.setdefault(sequence, error)
+    damaged = {name: error for name, error in damaged.items() if name not in attributes}
+    if not damaged:
+        return Attributes(attributes)
+    note = f"attributes of {len(damaged)} of {len(truth.files)} sequences are left out, such as "
+    return Attributes(attributes, (note + str(next(iter(damaged.values()))),))
 
 
 def _in_sequence_folders(root: Path) -> dict[str, Path]:
@@ -193,6 +339,82 @@ def _in_sequence_folders(root: Path) -> dict[str, Path]:
     folders = _folders(root)
     nested = (path for folder in folders for path in _folders(folder) if _is_nested(path))
     return _per_sequence([root, *folders]) or _per_sequence(nested)
+
+
+def _nfs(root: Path, fps: Fraction | None) -> dict[str, Path]:
+    """``<seq>/<rate>/<seq>.txt`` of one rate."""
+    rates: dict[str, dict[str, Path]] = {}
+    for folder in [root, *_folders(root)]:
+        name = folder.resolve().name
+        for rate in _NFS_RATES:
+            path = folder / rate / f"{name}.txt"
+            if path.is_file():
+                rates.setdefault(rate, {})[name] = path
+    if not rates:
+        return {}
+    if fps is None and len(rates) > 1:
+        raise LaeError(
+            f"{root}: NfS at {' and '.join(rates)} frames per second: say which is meant with "
+            f"{' or '.join(f'--fps {rate}' for rate in rates)}"
+        )
+    rate = next(iter(rates)) if fps is None else str(fps)
+    if rate not in rates:
+        raise LaeError(f"{root}: NfS at {' and '.join(rates)} frames per second, not at {rate}")
+    return rates[rate]
+
+
+def _rate(file: Path) -> Fraction | None:
+    """The frames per second that NfS's layout says."""
+    folder = file.resolve().parent
+    if folder.name not in _NFS_RATES or folder.parent.name != file.stem:
+        return None
+    return Fraction(folder.name)
+
+
+def _of_frames(boxes: Floats, frames: int, path: Path) -> Floats:
+    """NfS's truth of so many frames, if it fits but for the last one.
+
+    The files of 30 and of 240 frames/s are the same, and for the former every eighth row counts; so
+    do the GOT-10k toolkit and others (https://github.com/got-10k/toolkit).
+
+    Raises:
+        LaeError: if what should have 30 frames/s has as many frames as the truth of 240.
+    """
+    if _rate(path) == 30:
+        thinned = boxes[::_NFS_THINNED]
+        whole = path.parent.with_name("240") / path.name
+        if len(boxes) != frames and abs(len(thinned) - frames) <= 1:
+            boxes = thinned
+        elif abs(len(boxes) - frames) <= 1 and _is_same(path, whole):
+            raise LaeError(
+                f"{path}: NfS's truth of 240 frames per second, and what has as many frames is of "
+                "240 too: --fps 240"
+            )
+    if len(boxes) == frames - 1:
+        boxes = np.concatenate([boxes, np.full((1, 4), np.nan)])
+    return boxes[:frames] if len(boxes) == frames + 1 else boxes
+
+
+def _is_same(file: Path, other: Path) -> bool:
+    return other.is_file() and file.read_bytes() == other.read_bytes()
+
+
+def _instead(root: Path) -> str | None:
+    """What lies in a folder without ground truth that is known here, in words."""
+    paths = itertools.chain(root.glob("*"), root.glob("*/*"), root.glob("*/gt/gt.txt"))
+    for path in itertools.islice(paths, _MOST_LOOKED_AT):
+        if path.suffix.lower() not in _CONTAINERS or not path.is_file():
+            continue
+        try:
+            with path.open("rb") as file:
+                other = foreign(file.read(HEAD_BYTES))
+            if other is None and path.suffix.lower() == ".txt":
+                other = foreign_columns(read_numbers(path, nan=True))
+        except (OSError, LaeError):
+            continue
+        if other is not None:
+            return f"{path} {other}"
+    return None
 
 
 def _is_nested(folder: Path) -> bool:
@@ -229,7 +451,7 @@ def _annotation_folder(root: Path) -> Path:
             return inner[root.resolve().name]
         if len(inner) > 1:
             raise LaeError(
-                f"{folder}: holds the ground truth of {', '.join(inner)}; give one of them, "
+                f"{folder}: holds the ground truth of {listed(inner)}; give one of them, "
                 f"such as {next(iter(inner.values()))}"
             )
         if inner:
@@ -254,6 +476,8 @@ def _dataset(file: Path) -> str:
     folder = file.resolve().parent
     if _PER_SEQUENCE.match(file.name):
         return (folder.parent.parent if _is_nested(folder) else folder.parent).name
+    if _rate(file) is not None:
+        return folder.parent.parent.name
     return folder.parent.name if folder.name in _ANNOTATION_FOLDERS else folder.name
 
 
@@ -275,11 +499,14 @@ def _from_csv(path: Path, sequences: Iterable[str]) -> dict[str, tuple[str, ...]
     return attributes
 
 
-def _from_flags(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
+def _from_flags(path: Path, known: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    """The attributes that are flagged; which they are, their number says."""
     flags = read_numbers(path).ravel()
-    if len(flags) != len(names) or not np.isin(flags, (0, 1)).all():
-        raise LaeError(f"{path}: needs {len(names)} flags 0 or 1: {', '.join(names)}")
-    return _flagged(names, [str(int(flag)) for flag in flags])
+    for names in known:
+        if len(flags) == len(names) and np.isin(flags, (0, 1)).all():
+            return _flagged(names, [str(int(flag)) for flag in flags])
+    counts = " or ".join(str(len(names)) for names in known)
+    raise LaeError(f"{path}: needs {counts} flags 0 or 1")
 
 
 def _flagged(names: Iterable[str], flags: Iterable[str]) -> tuple[str, ...]:

@@ -19,12 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.datasets.absence import read_visible
 from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
 from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, image_number, missing, note
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.synthetic import synthetic_dataset
 from lae_sim.engine.clock import Number, parse_fps
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, listed, shown
 from lae_sim.files import sequence_names
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -37,6 +38,7 @@ _BESIDE_ANNOTATIONS = (
     "data_seq/UAV123/{}",
     "data_seq/UAV123_10fps/{}",
     "data_seq/{}",
+    "frames/{}",
     "{}/img",
     "{}",
 )
@@ -75,7 +77,7 @@ def find_dataset(
         sequences: names of those wanted; all by default.
         box: the first box ``x, y, w, h`` in pixels, for images or a video without ground truth.
         fps: frames per second; by default the dataset's (30, or 10 for UAV123_10fps and GOT-10k)
-            or the video's own.
+            or the video's own. Of NfS it chooses the set, of 30 or 240.
         frame_times: where numbers are missing among a sequence's images, as if the camera had
             dropped frames: ``"numbers"`` lets each image come at the time of its number, ``"even"``
             one after another. Without it such images are refused.
@@ -113,35 +115,41 @@ def find_dataset(
     if root.is_file() or box is not None:
         return _without_truth(name, root, sequences, box, fps, frame_times)
     name = _SPELLINGS.get((name or "").lower(), name)
-    truth = find_truth(root / "anno" / name if name and (root / "anno" / name).is_dir() else root)
+    named = root / "anno" / name if name else root
+    truth = find_truth(named if named.is_dir() else root, fps)
     if name is None:
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
-    found = [
-        _sequence(root, sequence, truth.files[sequence], attributes.get(sequence, ()))
-        for sequence in _choose(sequences, truth.files, str(root), truth.match)
-    ]
-    return _timed(name, fps or Fraction(_FPS.get(name, 30)), found, frame_times)
+    made, numbers = [], []
+    notes = [*attributes.notes]
+    for sequence in _choose(sequences, truth.files, str(root), truth.match):
+        file = truth.files[sequence]
+        found, of_images = _sequence(root, sequence, file, attributes.of.get(sequence, ()))
+        visible, problem = read_visible(file, len(found))
+        made.append(replace(found, visible=visible))
+        numbers.append(of_images)
+        notes += [f"sequence {sequence!r}: {problem}"] if problem else []
+    fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
+    return _timed(Dataset(name, fps, made, notes), numbers, frame_times)
 
 
-def _timed(
-    name: str,
-    fps: Fraction,
-    sequences: Sequence[tuple[ImageSequence, Sequence[int]]],
-    frame_times: str | None,
-) -> Dataset:
-    """The dataset of sequences with the numbers of their images."""
-    made = [sequence for sequence, _ in sequences]
-    gaps = [(sequence.name, numbers) for sequence, numbers in sequences if missing(numbers)]
+def _timed(dataset: Dataset, numbers: Sequence[Sequence[int]], frame_times: str | None) -> Dataset:
+    """The dataset with the times of its frames, given the numbers of each sequence's images."""
+    sequences = dataset.sequences
+    gaps = [sequence.name for sequence, own in zip(sequences, numbers) if missing(own)]
     if not gaps:
-        return Dataset(name, fps, made)
+        return dataset
     if frame_times is None:
-        raise ask(*gaps[0], fps)
+        first = next(s for s, own in enumerate(numbers) if missing(own))
+        raise ask(sequences[first].name, numbers[first], dataset.fps)
     if frame_times == "numbers":  # of all: a trace has the times of every frame, or of none
-        made = [replace(each, arrival_ns=arrivals(numbers, fps)) for each, numbers in sequences]
-    notes = (note((gap for gap, _ in gaps), frame_times),)
-    return Dataset(name, fps, made, frame_times, notes)
+        sequences = [
+            replace(sequence, arrival_ns=arrivals(own, dataset.fps))
+            for sequence, own in zip(sequences, numbers)
+        ]
+    notes = [*dataset.notes, note(gaps, frame_times)]
+    return replace(dataset, sequences=sequences, notes=notes, frame_times=frame_times)
 
 
 def _without_truth(
@@ -173,16 +181,16 @@ def _without_truth(
         read, length = partial(_read, sequence, paths), len(paths)
         numbers = _numbers(paths)
     truth = _only_first(np.array([box], np.float64), length)
-    images = [(ImageSequence(sequence, truth, read), numbers)]
-    return _timed(name or sequence, fps or Fraction(30), images, frame_times)
+    made = [ImageSequence(sequence, truth, read)]
+    return _timed(Dataset(name or sequence, fps or Fraction(30), made), [numbers], frame_times)
 
 
 def _sequence(
     root: Path, name: str, file: Path, attributes: tuple[str, ...]
 ) -> tuple[ImageSequence, Sequence[int]]:
     """A sequence, and the numbers of its images."""
-    truth = read_truth(file)
     paths, first = _find_images(root, name, file)
+    truth = read_truth(file, len(paths))
     if len(truth) == 1:
         truth = _only_first(truth, len(paths))
     if len(paths) > len(truth):
@@ -307,7 +315,7 @@ def _choose(
         if matching is None:
             close = difflib.get_close_matches(name, names) or names[:3]
             raise LaeError(
-                f"{where}: no sequence {name!r} among {len(names)}; there is {', '.join(close)}"
+                f"{where}: no sequence {shown(name)} among {len(names)}; there is {listed(close)}"
             )
         chosen.add(matching)
     return [name for name in names if not wanted or name in chosen]

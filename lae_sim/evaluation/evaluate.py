@@ -40,6 +40,8 @@ class ReplayStatistics:
         sequences: names, S of them.
         frames: world frames of each, int64 [S].
         truthless: world frames of each that have no ground truth, int64 [S].
+        absent: world frames of each whose target is said to be absent though they have a truth,
+            int64 [S]; -1 where nothing is said.
         scored: whether each has a truth to score by (:func:`.metrics.is_scored`), bool [S].
         missing: world frames of each without a box in the trace, int64 [S].
         processed: processed frames of each, int64 [S].
@@ -57,6 +59,7 @@ class ReplayStatistics:
     sequences: tuple[str, ...]
     frames: Ints
     truthless: Ints
+    absent: Ints
     scored: Bools
     missing: Ints
     processed: Ints
@@ -309,12 +312,13 @@ class _Offline:
     """What is scored of a recording alone, however it is replayed.
 
     Attributes:
-        truthless, scored, missing: see :class:`ReplayStatistics`.
+        truthless, absent, scored, missing: see :class:`ReplayStatistics`.
         scores: in the order of ``METRICS``.
         success, precision: see :class:`Curves`.
     """
 
     truthless: int
+    absent: int
     scored: bool
     missing: int
     scores: Sequence[float]
@@ -334,6 +338,7 @@ def _offline(
         for r, recording in enumerate(new):
             scored[recording] = _Offline(
                 truthless=int(np.isnan(recording.truth[:, 0]).sum()),
+                absent=_absent(recording),
                 scored=is_scored(recording.truth),
                 missing=int(np.isnan(recording.boxes[:, 0]).sum()),
                 scores=scores[r],
@@ -341,6 +346,13 @@ def _offline(
                 precision=offline.precision[r],
             )
     return {recording: value for recording, value in scored.items() if value is not None}
+
+
+def _absent(recording: Recording) -> int:
+    """How many frames with a truth are said to lack the target; -1 if nothing is said."""
+    if recording.visible is None:
+        return -1
+    return int((~recording.visible & ~np.isnan(recording.truth[:, 0])).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -454,6 +466,7 @@ def _replay_statistics(
         sequences=tuple(run.recording.name for run in runs),
         frames=pairing.lengths,
         truthless=np.array([each.truthless for each in offline], np.int64),
+        absent=np.array([each.absent for each in offline], np.int64),
         scored=np.array([each.scored for each in offline]),
         missing=np.array([each.missing for each in offline], np.int64),
         processed=np.diff(pairing.offsets),

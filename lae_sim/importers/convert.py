@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Ints
+from lae_sim.datasets.absence import absence_files, read_visible
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
-from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing
+from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing, note
 from lae_sim.datasets.layouts import image_numbers
 from lae_sim.engine.clock import Clock, Number, parse_fps
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, listed, shown
 from lae_sim.importers.coordinates import other_reading, row_0_is_off
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.importers.results import (
@@ -54,11 +55,11 @@ class ConversionSummary:
         median_ms: median time of a processed frame, ms.
         frame_times: how frames come where image numbers are missing: ``"numbers"`` or ``"even"``;
             None where none is, or no images are at hand.
-        numbers_missing: the sequences where some are.
         row_0_from_truth: sequences whose row 0 was more than 3 px off the initial box, from which
             the tracker started; in the trace it is that box.
         without_truth: results that were left out, since they have no ground truth.
         without_results: sequences of the ground truth that have no results.
+        notes: what else is to be said, a sentence each.
         files: what was read.
     """
 
@@ -73,10 +74,10 @@ class ConversionSummary:
     processed: int
     median_ms: float
     frame_times: str | None
-    numbers_missing: list[str]
     row_0_from_truth: list[str]
     without_truth: list[str]
     without_results: list[str]
+    notes: list[str]
     files: list[Path]
 
     def document(self, path: str | Path) -> dict[str, Any]:
@@ -113,7 +114,7 @@ def convert_results(
         truth: the dataset's folder (see :mod:`lae_sim.datasets.annotations`).
         format: a name of :data:`lae_sim.importers.results.FORMATS`, or ``"auto"``.
         fps: world frames per second, such as ``30`` or ``"30000/1001"``; by default 30, or 10 if
-            the dataset's name says ``10fps``.
+            the dataset's name says ``10fps``. Of NfS it chooses the set, of 30 or 240.
         time: where times come from (see :func:`lae_sim.importers.results.given_times`).
         time_unit: of measured times: ``"s"`` (the default), ``"ms"``, ``"us"`` or ``"ns"``.
         repetition: which run to take where the toolkit repeats them, from 1.
@@ -144,7 +145,7 @@ def convert_results(
         ...     for name in ("results", "anno"):
         ...         pathlib.Path(folder, name).mkdir()
         ...         boxes = "1,2,30,40" if name == "anno" else "3,2,30,40"
-        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes)
+        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes, "utf-8")
         ...     trace, summary = lae_sim.convert_results(
         ...         f"{folder}/results", f"{folder}/anno", time="constant:47ms"
         ...     )
@@ -160,7 +161,8 @@ def convert_results(
     results = Path(results)
     kind, sources = find_results(results, format, repetition)
     other = {name: Path(path) for name, path in (truth_files or {}).items()}
-    annotations = find_truth(Path(truth)).with_files(other)
+    asked = None if fps is None else parse_fps(fps)
+    annotations = find_truth(Path(truth), asked).with_files(other)
     known, without_truth = _with_truth(kind, sources, annotations, skip_missing)
     absent = sorted({*sequences, *exclude, *other} - set(known))
     if absent:
@@ -169,7 +171,7 @@ def convert_results(
     if not matched:
         raise LaeError("--exclude leaves no sequence")
     dataset = dataset or annotations.dataset
-    rate = str(fps or ("10" if "10fps" in dataset.lower() else 30))
+    rate = str(fps or annotations.fps or ("10" if "10fps" in dataset.lower() else 30))
     clock = Clock.at(parse_fps(rate))
     tracker = tracker or tracker_name(kind, results, matched)
     given = given_times(time, tracker)
@@ -187,6 +189,7 @@ def convert_results(
         recordings, timing = _every_frame(matched, annotations, read, given, progress)
     as_published = recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
+    recordings, notes = _flagged(recordings, annotations)
     incomplete: list[str] = []
     if kind != "lae-pvt":  # whose recorded loop took the frames evenly, whatever their numbers
         recordings, incomplete = _arrived(recordings, annotations, clock.fps, frame_times)
@@ -194,7 +197,10 @@ def convert_results(
         raise LaeError(
             "--frame-times numbers does not go with lae-pvt: its runs took frames evenly"
         )
+    if incomplete and frame_times:
+        notes.append(note(incomplete, frame_times))
     frame_times = frame_times if incomplete else None
+    attributes = read_attributes(annotations)
     metadata = Metadata.new(
         rate,
         **schedule,
@@ -202,7 +208,7 @@ def convert_results(
         device={"model": device} if device else {},
         dataset={"name": dataset, **({"frame_times": frame_times} if frame_times else {})},
         timing=timing,
-        sequences=_sequence_entries(matched, read_attributes(annotations), image_size),
+        sequences=_sequence_entries(matched, attributes.of, image_size),
     )
     left_out = {*matched, *exclude}
     elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
@@ -218,13 +224,16 @@ def convert_results(
         processed=int((elapsed >= 0).sum()),
         median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
         frame_times=frame_times,
-        numbers_missing=incomplete,
-        row_0_from_truth=[new.name for new, old in zip(recordings, as_published) if new is not old],
+        row_0_from_truth=[
+            new.name for new, old in zip(recordings, as_published) if new.boxes is not old.boxes
+        ],
         without_truth=without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
+        notes=[*attributes.notes, *notes],
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
             *annotations.files.values(),
+            *(file for truth in annotations.files.values() for file in absence_files(truth)),
             *((given.file,) if given and given.file else ()),
         ],
     )
@@ -269,7 +278,7 @@ def _every_frame(
     measured = True
     for name, source in matched.items():
         results = read(source)
-        boxes = read_truth(truth.files[name])
+        boxes = read_truth(truth.files[name], len(results.boxes))
         elapsed = _elapsed(name, source, results, given)
         if len(results.boxes) != len(boxes):
             raise LaeError(
@@ -392,6 +401,26 @@ def _arrived(
     return placed, incomplete
 
 
+def _flagged(
+    recordings: Iterable[Recording], truth: GroundTruth
+) -> tuple[list[Recording], list[str]]:
+    """The recordings with the dataset's flags of absence, and what is to be said of these."""
+    flagged, notes = [], []
+    for recording in recordings:
+        visible, note = read_visible(truth.files[recording.name], len(recording))
+        flagged.append(replace(recording, visible=visible))
+        notes += [f"sequence {recording.name!r}: {note}"] if note else []
+    absent = [int((~each.visible).sum()) for each in flagged if each.visible is not None]
+    if any(absent):
+        notes.insert(
+            0,
+            f"the target is said to be absent in {sum(absent):,} frames, in "
+            f"{np.count_nonzero(absent)} of {len(flagged)} sequences; --convention lasot leaves "
+            "them out",
+        )
+    return flagged, notes
+
+
 def _sequence_entries(
     names: Iterable[str],
     attributes: Mapping[str, tuple[str, ...]],
@@ -406,9 +435,3 @@ def _sequence_entries(
         }
         entries[name] = {key: value for key, value in entry.items() if value}
     return entries
-
-
-def listed(names: Sequence[str], most: int = 5) -> str:
-    """Some names, at most so many of them, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -177,7 +177,14 @@ def tegra(at: Path) -> str | None:
 def output(*command: str, seconds: float = 10) -> str | None:
     """What a program prints; None if it fails, hangs or is not there."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=True)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=seconds,
+            check=True,
+        )
     except (OSError, ValueError, subprocess.SubprocessError):
         return None
     return done.stdout

@@ -30,7 +30,7 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou, resized, search_distance, search_region, search_side
-from lae_sim.errors import LaeError, explained
+from lae_sim.errors import LaeError, explained, listed
 from lae_sim.forecast.base import AnyFactory, Forecaster, ImageSize, factory_for
 from lae_sim.replay.reach import (
     FOUND_IOU,
@@ -463,7 +463,7 @@ def _of_others(gaps: Iterable[Trace], metadata: Metadata) -> str:
     others = [of for of in all_of if not metadata.goes_with(of)]
     names = dict.fromkeys(f"of {of.tracker} on {of.dataset}" for of in others)
     some = ", some" if others and len(others) < len(all_of) else ""
-    return f"{some} {' and '.join(names)}" if others else ""
+    return f"{some} {listed(names)}" if others else ""
 
 
 def phase_answers(

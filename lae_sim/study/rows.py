@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -70,12 +71,11 @@ class CellRows:
     """Writes the rows of one cell, group after group, as a Parquet file in memory."""
 
     def __init__(self, sigmas: Sequence[Fraction], about: Mapping[str, str]) -> None:
-        import pyarrow as pa
         import pyarrow.parquet as pq
 
         self._sigmas = np.array([float(sigma) for sigma in sigmas])
         self._about = about
-        self._schema = pa.schema([pa.field(name, kind) for name, kind in COLUMNS.items()])
+        self._schema = _schema()
         self._file = io.BytesIO()
         texts = [name for name, kind in COLUMNS.items() if kind == "string"]
         self._writer = pq.ParquetWriter(
@@ -137,6 +137,12 @@ def _modelled(part: Evaluation, f: int) -> dict[str, Floats]:
     }
 
 
+def _schema() -> Any:
+    import pyarrow as pa
+
+    return pa.schema([pa.field(name, kind) for name, kind in COLUMNS.items()])
+
+
 def read_rows(path: Path, columns: Sequence[str]) -> Any:
     """Some columns of a cell's file, as one Arrow table of one chunk.
 
@@ -147,7 +153,9 @@ def read_rows(path: Path, columns: Sequence[str]) -> Any:
     import pyarrow.parquet as pq
 
     try:
-        with pq.ParquetFile(path) as file:
+        with pa.OSFile(os.fsencode(path)) as source, pq.ParquetFile(source) as file:
+            if not file.schema_arrow.equals(_schema()):
+                raise ValueError("other columns")
             return file.read(columns).combine_chunks()
     except (pa.ArrowException, OSError, ValueError) as error:
         raise LaeError(f"{path}: damaged: delete it, and run the study again") from error

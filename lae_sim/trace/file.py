@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lae_sim.errors import LaeError, TraceError, hint, shown
+from lae_sim.errors import LaeError, TraceError, hint, listed, shown
 from lae_sim.files import sequence_names, written_whole
 from lae_sim.trace.checks import COLUMN_TYPES, RowChecker, check_schema
 from lae_sim.trace.columns import BOX, TRUTH, Nullable, Rows, checksums
@@ -216,8 +216,9 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
     check = RowChecker(str(path), metadata.profiled, restarts=metadata.kind == "restarts")
     with (
         written_whole(path) as temporary,
+        pa.OSFile(os.fsencode(temporary), "wb") as sink,  # whose name need not be UTF-8
         pq.ParquetWriter(
-            temporary,
+            sink,
             schema,
             compression="zstd",
             compression_level=1,
@@ -407,7 +408,7 @@ class _StoredRecordings:
 def _listed(missing: Iterable[str], known: Iterable[str] = ()) -> str:
     """Sequences that are not there, with what may have been meant by one."""
     names = sorted(missing, key=str)
-    return ", ".join(map(repr, names)) + (hint(names[0], known) if len(names) == 1 else "")
+    return listed(map(repr, names)) + (hint(names[0], known) if len(names) == 1 else "")
 
 
 def _joined(parts: list[Recording]) -> Recording:

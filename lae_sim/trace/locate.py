@@ -42,13 +42,17 @@ def find_traces(patterns: Sequence[str], base: Path | None = None) -> list[str]:
 
 @contextmanager
 def opened(path: str) -> Iterator[Any]:
-    """What pyarrow reads a trace from: the path itself, or of a URL a file that can seek.
+    """What pyarrow reads a trace from: a file, or of a URL one that can seek.
 
     Raises:
-        LaeError: if a URL cannot be opened; a path is not opened here.
+        LaeError: if a URL cannot be opened.
+        OSError, ValueError: if a file cannot be.
     """
     if not is_url(path):
-        yield path
+        import pyarrow as pa
+
+        with pa.OSFile(os.fsencode(path)) as file:  # whose name need not be UTF-8
+            yield file
         return
     with _explained(path):
         file = _binary(path)

@@ -10,7 +10,7 @@ from typing import Any
 
 import cv2
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed
 from lae_sim.trackers.protocol import Image, checked_box, checked_frame, weights_digest
 
 _MAIN = {"mil": "MIL", "nano": "Nano", "vit": "Vit", "dasiamrpn": "DaSiamRPN", "goturn": "GOTURN"}
@@ -194,7 +194,7 @@ def _checked_files(name: str, given: dict[str, str]) -> dict[str, str]:
     wanted = list(_FILES.get(name, {}))
     extra = [option for option in given if option not in wanted]
     if extra:
-        raise LaeError(f"opencv:{name} takes no {', '.join(extra)}")
+        raise LaeError(f"opencv:{name} takes no {listed(extra)}")
     lacking = [option for option in wanted if not Path(given.get(option, "")).is_file()]
     if lacking:
         missing = ", ".join(f"{o}={given.get(o, 'FILE')}" for o in lacking)

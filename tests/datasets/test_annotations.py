@@ -1,7 +1,16 @@
+import re
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
-from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
+from lae_sim.datasets.annotations import (
+    Attributes,
+    find_truth,
+    read_attributes,
+    read_truth,
+    read_vatic,
+)
 from lae_sim.errors import LaeError
 
 BOXES = "10,20,30,40\n11,21,30,40\n"
@@ -99,6 +108,99 @@ def test_missing_truth_is_nan_and_zeros_stay(tmp_path):
     assert boxes[[0, 2]].tolist() == [[1, 2, 3, 4], [0, 0, 0, 0]]
 
 
+def test_rows_of_vot_without_a_target(tmp_path):
+    text = "1,2,5,1,6,7,0,8\n0\nnan,nan,nan,nan\nNaN,NaN,NaN,NaN,NaN,NaN,NaN,NaN\n1,2,5,1,6,7,0,8\n"
+    make(tmp_path, "a.txt", text=text)
+    boxes = read_truth(tmp_path / "a.txt")
+    assert np.isnan(boxes[1:4]).all()
+    assert boxes[[0, 4]].tolist() == [[0, 1, 6, 7], [0, 1, 6, 7]]
+
+
+def vatic(boxes, first=0, **more):
+    """Rows of VATIC of boxes x, y, w, h."""
+    lost = more.get("lost", ())
+    rows = [
+        f'0 {x} {y} {x + w} {y + h} {first + k} {int(k in lost)} 0 1 "soccer ball"'
+        for k, (x, y, w, h) in enumerate(boxes)
+    ]
+    return "\n".join(rows) + "\n"
+
+
+WAY = [[10 + 3 * k, 20, 30, 40 + k] for k in range(17)]
+
+
+def test_nfs_as_it_is_downloaded(tmp_path):
+    files = [f"NfS/{name}/{rate}/{name}.txt" for name in ("ball", "bee_1") for rate in (30, 240)]
+    root = make(tmp_path, *files, text=vatic(WAY)) / "NfS"
+    with pytest.raises(LaeError, match=r"NfS at 30 and 240 frames per second: .*--fps 30 or"):
+        find_truth(root)
+    with pytest.raises(LaeError, match="NfS at 30 and 240 frames per second, not at 25"):
+        find_truth(root, Fraction(25))
+    for fps in (30, 240):
+        truth = find_truth(root, Fraction(fps))
+        assert (truth.dataset, list(truth.files), truth.fps) == ("NfS", ["ball", "bee_1"], fps)
+        assert truth.files["ball"] == root / "ball" / str(fps) / "ball.txt"
+    assert find_truth(root / "ball", Fraction(30)).dataset == "NfS"
+    assert find_truth(root / "ball" / "240" / "ball.txt").fps == 240
+
+
+def test_nfs_of_30_frames_per_second_is_every_eighth_row(tmp_path):
+    root = make(tmp_path, "b/30/b.txt", "b/240/b.txt", text=vatic(WAY, first=1))
+    slow, fast = root / "b" / "30" / "b.txt", root / "b" / "240" / "b.txt"
+    assert read_truth(fast).tolist() == read_truth(fast, 17).tolist() == WAY
+    assert read_truth(slow, 3).tolist() == [WAY[0], WAY[8], WAY[16]]
+    assert read_truth(slow, 2).tolist() == [WAY[0], WAY[8]]  # the last image is missing
+    one_more = read_truth(slow, 4)
+    assert one_more[:3].tolist() == [WAY[0], WAY[8], WAY[16]]
+    assert np.isnan(one_more[3]).all()
+    with pytest.raises(LaeError, match="is of 240 too: --fps 240"):
+        read_truth(slow, 17)
+    make(tmp_path, "b/30/b.txt", text=vatic(WAY[::8]))  # as somebody thinned it out
+    assert read_truth(slow, 3).tolist() == [WAY[0], WAY[8], WAY[16]]
+
+
+def test_vatic(tmp_path):
+    text = vatic(WAY[:5], lost=(1, 2))
+    boxes, lost = read_vatic(tmp_path / "a.txt", text.splitlines())
+    assert boxes.tolist() == WAY[:5]
+    assert lost.tolist() == [False, True, True, False, False]
+    gap = text.splitlines()[:2] + text.splitlines()[3:]
+    boxes, lost = read_vatic(tmp_path / "a.txt", gap)
+    assert np.isnan(boxes[2]).all()
+    assert boxes[3:].tolist() == WAY[3:5]
+    assert lost.tolist() == [False, True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("row", "problem"),
+    [
+        ("1,2,3,4", "line 3: not a row of VATIC as line 1 is"),
+        ('1 1 2 3 4 2 0 0 0 "x"', r"line 3: another target \(id 1\)"),
+        ('0 1 2 3 4 1 0 0 0 "x"', "line 3: frame 1 is there twice"),
+        ('0 1 2 3 4 999999999 0 0 0 "x"', "frames up to 999999999, of which it has 3"),
+    ],
+)
+def test_bad_vatic(tmp_path, row, problem):
+    make(tmp_path, "a.txt", text=vatic(WAY[:2]) + row)
+    with pytest.raises(LaeError, match=problem):
+        read_truth(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "what"),
+    [
+        ("annotations/instances.json", '{"images": [{"file_name": "1.jpg"}]}', "COCO's JSON"),
+        ("MOT17-02/gt/gt.txt", "1,1,10,20,30,40,1,1,0.8\n", "MOT's format"),
+        ("Annotations/1.xml", "<annotation><object/></annotation>", "XML"),
+        ("OTB.zip", "PK\3\4", r"an archive \(zip\); unpack it"),
+    ],
+)
+def test_what_is_there_instead_of_truth(tmp_path, file, text, what):
+    make(tmp_path, file, text=text)
+    with pytest.raises(LaeError, match=f"no ground truth found; .*{file} looks like {what}"):
+        find_truth(tmp_path)
+
+
 def test_polygons_become_boxes_around_them(tmp_path):
     text = "1,2,5,1,6,7,0,8\nNaN,NaN,NaN,NaN,NaN,NaN,NaN,NaN\n"
     make(tmp_path, "a.txt", text=text)
@@ -109,7 +211,20 @@ def test_polygons_become_boxes_around_them(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "problem"),
-    [("1,2,3\n", "3 columns; ground truth has 4"), ("1,2,3,4\n1,2,NaN,4\n", "line 2: NaN in some")],
+    [
+        ("1,2,3\n", "3 columns; ground truth has 4"),
+        ("1,2,3,4\n1,2,NaN,4\n", "line 2: NaN in some"),
+        ("1,2,3,4\n1,2,3,4,5,6,7,8\n", "line 2: 8 columns"),
+        ("0\n0\n", "1 columns; ground truth has 4"),
+        ("x,y,w,h\n1,2,3,4\n", "line 1: 'x' is not a number; the line looks like a header"),
+        ("10,5;20,5;30,0;40,0\n", "line 1: .* decimal points, and one separator"),
+        ("0.1,0.2,0.05,0.1\n0.1,0.2,0.05,0.1\n", "looks like boxes in parts of the image"),
+        ("0 0.5 0.5 0.1 0.2\n2 0.4 0.1 0.2 0.2\n", "looks like YOLO's format"),
+        ("1,1,10,20,30,40,1,1,0.8\n2,1,10,20,30,40,1,1,0.9\n", "MOT's format .*keep x,y,w,h of"),
+        ("1,-1,10,20,30,40,0.9\n1,-1,10,20,30,40,0.9\n", "MOT's format"),
+        ("100,90,30,40,1,4,0,1\n", "VisDrone's detections"),
+        ("m12,40,10,20,0,4\nm12,40,10,20,0,4\n", "masks of VOT"),
+    ],
 )
 def test_bad_truth(tmp_path, text, problem):
     make(tmp_path, "a.txt", text=text)
@@ -121,14 +236,15 @@ def test_attributes_csv(tmp_path):
     make(tmp_path, "D/anno/a.txt", "D/anno/b.txt")
     make(tmp_path, "D/attributes.csv", text="sequence,Occlusion,Fast motion\na,1,0\nb,1,1\nc,0,0\n")
     expected = {"a": ("Occlusion",), "b": ("Occlusion", "Fast motion")}
-    assert read_attributes(find_truth(tmp_path / "D")) == expected
-    assert read_attributes(find_truth(tmp_path / "D" / "anno")) == expected
+    assert read_attributes(find_truth(tmp_path / "D")) == Attributes(expected)
+    assert read_attributes(find_truth(tmp_path / "D" / "anno")) == Attributes(expected)
 
 
 @pytest.mark.parametrize(
     ("truth", "flags", "count", "first"),
     [
         ("UAV123/anno/UAV123/bike1.txt", "UAV123/anno/UAV123/att/bike1.txt", 12, "Scale variation"),
+        ("DTB70/anno/bike1.txt", "DTB70/anno/att/bike1.txt", 11, "Scale variation"),
         ("UAVDT/anno/bike1_gt.txt", "UAVDT/att/bike1_att.txt", 9, "Background clutter"),
         ("V/annotations/bike1.txt", "V/attributes/bike1_attr.txt", 12, "Aspect Ratio Change"),
     ],
@@ -138,10 +254,13 @@ def test_official_attribute_folders(tmp_path, truth, flags, count, first):
     make(tmp_path, flags, text=",".join(["1"] + ["0"] * (count - 1)) + "\n")
     found = find_truth(tmp_path / truth.split("/")[0])
     assert list(found.files) == ["bike1"]
-    assert read_attributes(found) == {"bike1": (first,)}
+    assert read_attributes(found) == Attributes({"bike1": (first,)})
     make(tmp_path, flags, text="1,0,1\n")
-    with pytest.raises(LaeError, match=f"needs {count} flags"):
-        read_attributes(found)
+    left_out = read_attributes(found)
+    assert left_out.of == {}
+    (note,) = left_out.notes
+    assert note.startswith(f"attributes of 1 of 1 sequences are left out, such as {tmp_path}")
+    assert re.search(rf"needs .*\b{count}\b.* flags 0 or 1\Z", note)
 
 
 @pytest.mark.parametrize(
@@ -150,8 +269,27 @@ def test_official_attribute_folders(tmp_path, truth, flags, count, first):
 def test_damaged_attributes(tmp_path, text):
     make(tmp_path, "a.txt")
     make(tmp_path, "attributes.csv", text=text)
-    with pytest.raises(LaeError, match=r"attributes\.csv"):
-        read_attributes(find_truth(tmp_path))
+    attributes = read_attributes(find_truth(tmp_path))
+    assert attributes.of == {}
+    assert attributes.notes[0].startswith(f"attributes are left out: {tmp_path / 'attributes.csv'}")
+
+
+def test_one_damaged_file_of_flags_costs_its_own_sequence_only(tmp_path):
+    make(tmp_path, "anno/a.txt", "anno/b.txt")
+    make(tmp_path, "anno/att/a.txt", text="0,1,0,1,0,1,0,0,1,0,1\n")
+    make(tmp_path, "anno/att/b.txt", text="<html>")
+    attributes = read_attributes(find_truth(tmp_path))
+    # the official order: perfPlot.m of https://github.com/flyers/drone-tracking, then motion blur
+    assert attributes.of == {
+        "a": (
+            "Aspect ratio variation",
+            "Deformation",
+            "In-plane rotation",
+            "Background clutter",
+            "Motion blur",
+        )
+    }
+    assert "b.txt: looks like a web page" in attributes.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -195,6 +333,6 @@ def test_real_datasets(shared_data, dataset, sequences, frames, attributes):
     truth = find_truth(shared_data / dataset)
     assert (truth.dataset, len(truth.files)) == (dataset, sequences)
     assert sum(len(read_truth(path)) for path in truth.files.values()) == frames
-    found = read_attributes(truth)
+    found = read_attributes(truth).of
     assert len(found) == (sequences if attributes else 0)
     assert len({name for names in found.values() for name in names}) == attributes

@@ -29,6 +29,8 @@ def written(tmp_path):
         "1; 2.5; -3; 40\r\n5;6;7;8\r\n",
         "1, 2.5, -3, 40,\n5, 6, 7, 8,\n",
         "\ufeff1,2.5,-3,40\n5,6,7,8\n",
+        "1 ,2.5 ,\t-3, 40\n5, 6,7,  8\n",
+        "1,2.5,-3,40\n5,6,7,8\n".encode("utf-16"),
     ],
 )
 def test_separators(written, text):
@@ -47,6 +49,10 @@ def test_separators(written, text):
         ("1,nan\n", 1, "'nan'"),
         ("1,1e999\n", 1, "'1e999'"),
         ("1,,2\n", 1, "''"),
+        ("1,5;2,5\n", 1, "decimal points, and one separator"),
+        ("1,5 2,5\n", 1, "decimal points, and one separator"),
+        ("1,2\n10\t2,5\n", 2, "decimal points, and one separator"),
+        ("x,y\n1,2\n", 1, "'x' is not a number; the line looks like a header: remove it"),
     ],
 )
 def test_faults_name_the_line(written, text, line, problem):
@@ -61,6 +67,15 @@ def test_nan_where_allowed(written):
     assert np.isnan(read_numbers(written("NaN,nan\n1,2\n"), nan=True)[0]).all()
     with pytest.raises(LaeError, match="'nana'"):
         read_numbers(written("nana,1\n"), nan=True)
+
+
+def test_rows_without_a_target_where_allowed(written):
+    table = read_numbers(written("1,2\n0\nnan,NaN,nan\n3,4\nnan\n"), nan=True, absent=True)
+    assert np.isnan(table[[1, 2, 4]]).all()
+    assert table[[0, 3]].tolist() == [[1, 2], [3, 4]]
+    assert np.isnan(read_numbers(written("nan,nan\nNaN,NaN\n"), nan=True, absent=True)).all()
+    with pytest.raises(LaeError, match="line 2: 1 columns, and the lines before have 2"):
+        read_numbers(written("1,2\n1\n"), nan=True, absent=True)
 
 
 @pytest.mark.parametrize(

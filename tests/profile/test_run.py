@@ -6,6 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -125,3 +126,37 @@ def test_a_failure_shows_in_html_as_text() -> None:
     failed = Profile((), (Failure("<b>", "<script>"),))
     assert "<script>" not in failed._repr_html_()
     assert "failed: &lt;b&gt;: &lt;script&gt;" in failed._repr_html_()
+
+
+def test_flags_of_absence_are_profiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "still.py").write_text(
+        "class Still:\n"
+        "    def init(self, frame, box):\n"
+        "        self.box = list(box)\n"
+        "    def track(self, frame):\n"
+        "        return self.box\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    for name, flags in (("a", None), ("b", "0,1,0,0"), ("c", "0,1")):
+        folder = tmp_path / "data" / name
+        (folder / "img").mkdir(parents=True)
+        for i in range(4):
+            cv2.imwrite(str(folder / "img" / f"{i + 1:04}.png"), np.zeros((40, 60, 3), np.uint8))
+        (folder / "groundtruth.txt").write_text("10,10,20,20\n" * 4)
+        if flags is not None:
+            (folder / "full_occlusion.txt").write_text(flags)
+    notices: list[str] = []
+    plan = ProfilePlan.of(
+        tracker="still:Still", root=tmp_path / "data", in_process=True, strides=[2]
+    )
+    profile = run_profile(plan, tmp_path / "t.parquet", notice=notices.append)
+    assert [note for note in notices if "'c'" in note] == [notices[0]]
+    assert "full_occlusion.txt: 2 flags, and there are 4 frames" in notices[0]
+    for each in profile.traces:
+        trace = read_trace(each.trace)
+        assert trace.columns == {"visible"}
+        assert trace.metadata.document["version"] == "1.1"
+        a, b, c = trace
+        assert (a.visible, c.visible) == (None, None)
+        assert b.visible is not None
+        assert b.visible.tolist() == [True, False, True, True]
