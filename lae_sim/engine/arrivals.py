@@ -107,3 +107,6 @@ class FrameTime(float):
 
     def __index__(self) -> int:
         return self._number
+
+    def __getnewargs__(self) -> tuple[float, int]:  # of copies
+        return float(self), self._number
