@@ -108,5 +108,5 @@ class FrameTime(float):
     def __index__(self) -> int:
         return self._number
 
-    def __getnewargs__(self) -> tuple[float, int]:  # of copies
+    def __getnewargs__(self) -> tuple[float, int]:  # type: ignore[override]  # of copies
         return float(self), self._number
