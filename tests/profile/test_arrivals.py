@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lae_sim
-from lae_sim.cli import convert, profile, replay, study
+from lae_sim.cli import convert, profile, replay, show, study
 from lae_sim.datasets.frames import Dataset
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import every, fifo, latest, shrinking_tail
@@ -202,6 +202,16 @@ def test_outputs_say_when_frames_came(
     assert study.main([str(tmp_path / "s.toml"), *quick, "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["summary"]
     assert [row["fps"] for row in rows] == ["30", "60"]
+
+
+def test_show_says_that_frames_came_at_times_of_their_own(
+    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "n.parquet"
+    profiled(ball, path, "--frame-times", "numbers")
+    capsys.readouterr()
+    assert show.main([str(path)]) == 0
+    assert "arriving at times of their own, up to 66.7 ms apart" in capsys.readouterr().out
 
 
 def test_a_study_counts_ages_by_arrivals(
