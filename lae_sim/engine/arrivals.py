@@ -6,7 +6,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -44,6 +44,8 @@ class _ArrivalClock(Clock):
         ticks: when each frame arrives, int64 [T].
     """
 
+    is_even: ClassVar[bool] = False
+
     ticks: Ints
 
     __eq__ = object.__eq__
@@ -56,10 +58,6 @@ class _ArrivalClock(Clock):
     def _table(self) -> list[int]:
         table: list[int] = self.ticks.tolist()  # in which bisect is fast
         return table
-
-    @property
-    def is_even(self) -> bool:
-        return False
 
     def arrival(self, frame: Count) -> Count:
         if isinstance(frame, np.ndarray):
@@ -78,12 +76,10 @@ class _ArrivalClock(Clock):
             raise LaeError(f"{length} frames, but arrival times of {len(self.ticks)}")
         return self._table[-1] + self.frame_ticks
 
-    def interval(self, frame: Count) -> Count | int:
-        return self.arrival(frame + 1) - self.arrival(frame)
-
     def tail_shrinks(self, newest: Count, now: Count, later: int) -> Any:
-        then = now + later
-        return then - self.arrival(self.newest(then)) < now - self.arrival(newest)
+        arrived, then = self.arrival(newest), now + later
+        longer = later > self.arrival(newest + 1) - arrived
+        return longer & (then - self.arrival(self.newest(then)) < now - arrived)
 
     def frame_time(self, frame: Count) -> Any:
         time = self.arrival(frame) / self.frame_ticks
@@ -111,3 +107,6 @@ class FrameTime(float):
 
     def __index__(self) -> int:
         return self._number
+
+    def __getnewargs__(self) -> tuple[float, int]:  # type: ignore[override]  # of copies
+        return float(self), self._number

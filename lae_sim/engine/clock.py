@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from numbers import Integral
 from operator import index
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 from lae_sim.errors import LaeError, shown
 
@@ -203,6 +203,7 @@ class Clock:
     Attributes:
         ticks_per_ns: p, the numerator of the frame rate p/q.
         frame_ticks: ticks of the nominal frame interval, ``q * 10**9``.
+        is_even: whether frames arrive at equal intervals.
 
     Example:
         >>> from lae_sim.engine import Clock
@@ -213,6 +214,8 @@ class Clock:
         >>> dropped.newest(clock.arrival(2)), dropped.end(3) == clock.end(4)
         (1, True)
     """
+
+    is_even: ClassVar[bool] = True
 
     ticks_per_ns: int
     frame_ticks: int
@@ -249,11 +252,6 @@ class Clock:
         """World frames per second."""
         return Fraction(self.ticks_per_ns * NS_PER_SECOND, self.frame_ticks)
 
-    @property
-    def is_even(self) -> bool:
-        """Whether frames arrive at equal intervals."""
-        return True
-
     def arrival(self, frame: Count) -> Count:
         """The tick at which a frame arrives, or int64 [n] of n frames."""
         return frame * self.frame_ticks
@@ -266,21 +264,19 @@ class Clock:
         """The tick at which a stream of so many frames ends: an interval after the last one."""
         return length * self.frame_ticks
 
-    def interval(self, frame: Count) -> Count | int:
-        """Ticks from a frame's arrival to the next one's."""
-        return self.frame_ticks
-
     def tail_shrinks(self, newest: Count, now: Count, later: int) -> Any:
-        """Whether a tick has a longer tail than the one so much later, bool.
+        """Whether an answer at ``now + later`` has a shorter tail than one at ``now``, bool.
 
-        A tick's tail is the time since the newest frame arrived.
+        A tail is the time since the newest frame arrived. Where ``later`` is at most the interval
+        from that frame to the next, it does not count as shorter.
 
         Args:
             newest: the newest frame that has arrived at ``now``.
-            now: the tick.
-            later: ticks from it to the other.
+            now: a tick.
+            later: ticks from it to another.
         """
-        return now - newest * self.frame_ticks >= self.frame_ticks - later % self.frame_ticks
+        interval = self.frame_ticks  # a tail shrinks where adding to it reaches an arrival
+        return later > interval and now - newest * interval >= interval - later % interval
 
     def frame_time(self, frame: Count) -> Any:
         """When a frame arrives, in nominal frame intervals after frame 0: its number, or a float.

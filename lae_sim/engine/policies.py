@@ -100,9 +100,8 @@ class _ShrinkingTail(_ByLastCall):
     def next_lanes(self, clock: Clock, last: Count, now: Count) -> Count:
         newest = clock.newest(now)
         expected = self.expected_ns * clock.ticks_per_ns
-        if expected > clock.interval(newest):
-            newest = newest + clock.tail_shrinks(newest, now, expected)
-        return _later(newest, last + 1)
+        chosen: Count = newest + clock.tail_shrinks(newest, now, expected)
+        return _later(chosen, last + 1)
 
 
 _BEYOND = 2**40  # no sequence has so many frames

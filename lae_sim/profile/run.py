@@ -298,8 +298,8 @@ def run_profile(
             "remove it to profile anew"
         )
         return Profile((), ())
-    for said in dataset.notes:
-        notice(said)
+    for note in dataset.notes:
+        notice(f"note: {note}")
     failures: dict[str, list[Failure]] = {}
     interrupted = False
     with closing(_start(plan, notice)) as started:

@@ -96,6 +96,10 @@ def _frames(report: Mapping[str, Any]) -> str:
         "all processed" if processed == frames else f"{processed:,} processed",
         "all with truth" if report["with_truth"] == frames else f"{report['with_truth']:,} truths",
     ]
+    if report["longest_interval_ms"] is not None:
+        parts[0] += (
+            f", arriving at times of their own, up to {report['longest_interval_ms']:.3g} ms apart"
+        )
     sizes = [size for size in report["image_sizes"] if size != "unknown"]
     if sizes:
         parts.append(", ".join(sizes[:4]) + (" and others" if len(sizes) > 4 else "") + " px")

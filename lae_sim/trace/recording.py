@@ -135,7 +135,10 @@ class Recording:
         all_boxes[schedule.frames] = boxes
         all_scores[schedule.frames] = np.nan if score is None else score
         elapsed[schedule.frames] = schedule.elapsed_ns
-        return cls.new(name, truth, all_boxes, elapsed, all_scores, visible=visible)
+        clock, arrivals = schedule.clock, None
+        if not clock.is_even:
+            arrivals = clock.arrival(np.arange(schedule.length)) // clock.ticks_per_ns
+        return cls.new(name, truth, all_boxes, elapsed, all_scores, arrivals, visible)
 
 
 OPTIONAL_COLUMNS: Mapping[str, type[np.generic]] = {"arrival_ns": np.int64, "visible": np.bool_}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Sequence
 from fractions import Fraction
 
@@ -11,6 +13,7 @@ from arriving import Arriving, arriving
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lae_sim.engine.arrivals import FrameTime
 from lae_sim.engine.clock import MAX_INT64, Clock
 from lae_sim.engine.lanes import simulate_lanes
 from lae_sim.engine.policies import every, fifo, latest, listed, shrinking_tail, vot_realtime
@@ -129,6 +132,15 @@ def test_a_policy_that_counts_intervals_is_told_whom_to_ask() -> None:
     assert len(simulate(3, EVEN, lambda frame: 0, mine).frames) == 3
     with pytest.raises(LaeError, match=r"clock\.arrival and clock\.newest know the arrivals"):
         simulate(3, EVEN.with_arrivals([0, 40 * MS, 160 * MS]), lambda frame: 0, mine)
+
+
+def test_a_frames_time_is_its_number_as_an_index() -> None:
+    frame = FrameTime(2.5, 1)
+    assert (frame - 2, frame * 2) == (0.5, 5.0)
+    for same in (frame, copy.deepcopy(frame), pickle.loads(pickle.dumps(frame))):
+        assert ["a", "b"][same] == "b"
+        assert np.array([[1, 2], [3, 4]])[same].tolist() == [3, 4]
+        assert same == 2.5
 
 
 def test_listed_frames_wait_for_their_arrival() -> None:
