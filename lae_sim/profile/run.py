@@ -55,6 +55,7 @@ from lae_sim.replay.latency import time_label
 from lae_sim.replay.strides import phases
 from lae_sim.replay.world import flag, named, parse_policy, several, text
 from lae_sim.trace.file import check_replaces, read_trace
+from lae_sim.trace.metadata import text_fault
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -298,6 +299,9 @@ def run_profile(
             "remove it to profile anew"
         )
         return Profile((), ())
+    for sequence in dataset.sequences:
+        if fault := text_fault(sequence.name):
+            raise LaeError(f"sequence {sequence.name!r}: the name {fault}: rename it")
     for note in dataset.notes:
         notice(f"note: {note}")
     failures: dict[str, list[Failure]] = {}

@@ -20,6 +20,7 @@ FORMAT = "lae-trace"
 VERSION = "1.0"
 NEWER_VERSION = "1.1"
 """Of traces with optional columns, and of restarts, whose kind readers of 1.0 do not know."""
+_UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 KINDS = ("every-frame", "real-time", "restarts")
 TRACES_TIMES = "the trace's times: "
 
@@ -282,6 +283,30 @@ def version_of(kind: str) -> str:
     return NEWER_VERSION if kind == "restarts" else VERSION
 
 
+def text_fault(text: str) -> str | None:
+    """Why a text may not be in a trace; None if it may."""
+    found = _UNFIT.search(text)
+    if found is None:
+        return None
+    if found[0] >= "\ud800":
+        return f"is not Unicode text: it holds {found[0]!r}, half of a character"
+    return f"holds the control character {found[0]!r}"
+
+
+def _check_texts(document: Mapping[str, Any]) -> None:
+    """Check every key and text, however deep."""
+    left: list[tuple[str, Any]] = [(key, (key, value)) for key, value in document.items()]
+    while left:
+        where, value = left.pop()
+        if isinstance(value, str):
+            if fault := text_fault(value):
+                raise TraceError(f"metadata key {where[:200]!r} {fault}")
+        elif isinstance(value, dict):
+            left += [(f"{where}.{key}", (key, inner)) for key, inner in value.items()]
+        elif isinstance(value, (list, tuple)):  # a tuple is a key and its value
+            left += [(where, inner) for inner in value]
+
+
 def _finite(text: str) -> float:
     value = float(text)
     if value in (float("inf"), float("-inf")):
@@ -319,7 +344,8 @@ def _kind(document: Mapping[str, Any]) -> str:
 
 
 def _checked(document: dict[str, Any]) -> dict[str, Any]:
-    """Check the types of the optional keys that lae_sim reads."""
+    """Check all texts, and the types of the optional keys that lae_sim reads."""
+    _check_texts(document)
     for key in ("tracker", "device", "timing", "sequences"):
         if not isinstance(document.get(key, {}), dict):
             raise TraceError(f"metadata key {key!r} must be a JSON object")

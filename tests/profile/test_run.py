@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -182,3 +183,43 @@ def test_flags_of_absence_are_profiled(tmp_path: Path, monkeypatch: pytest.Monke
         assert (a.visible, c.visible) == (None, None)
         assert b.visible is not None
         assert b.visible.tolist() == [True, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("said", "problem"),
+    [
+        ("{'settings': {'lr': float('nan')}}", "NaN is not JSON"),
+        ("{'settings': {'lr': float('-inf')}}", "-Infinity is not JSON"),
+        ("{'version': '1.0\\x1b[2J'}", "'tracker.version' holds the control character"),
+    ],
+)
+def test_what_a_tracker_says_of_itself_must_fit_a_trace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str, problem: str
+) -> None:
+    (tmp_path / "odd.py").write_text(
+        "class Odd:\n"
+        "    def init(self, frame, box):\n"
+        "        pass\n"
+        "    def track(self, frame):\n"
+        "        return [1, 2, 3, 4]\n"
+        "    def describe(self):\n"
+        f"        return {said}\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "odd", raising=False)
+    with pytest.raises(LaeError, match=r"^odd:Odd: what describe\(\) says") as caught:
+        run_profile(ProfilePlan.of(tracker="odd:Odd", **QUICK), tmp_path / "t.parquet")
+    assert problem in str(caught.value)
+    assert sorted(path.name for path in tmp_path.glob("t.*")) == []
+
+
+def test_a_sequence_that_no_trace_can_name_is_refused_before_anything_is_run(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "data" / "a\x1b[2J"
+    (folder / "img").mkdir(parents=True)
+    cv2.imwrite(str(folder / "img" / "1.png"), np.zeros((40, 60, 3), np.uint8))
+    (folder / "groundtruth.txt").write_text("10,10,20,20\n")
+    plan = ProfilePlan.of(root=tmp_path / "data", in_process=True)
+    with pytest.raises(LaeError, match=r"the name holds the control character .*: rename it"):
+        run_profile(plan, tmp_path / "t.parquet")
