@@ -131,7 +131,7 @@ def find_dataset(
         numbers.append(of_images)
         notes += [f"sequence {sequence!r}: {problem}"] if problem else []
     fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
-    return _timed(Dataset(name, fps, made, notes), numbers, frame_times)
+    return _timed(Dataset(name, fps, made, tuple(notes)), numbers, frame_times)
 
 
 def _timed(dataset: Dataset, numbers: Sequence[Sequence[int]], frame_times: str | None) -> Dataset:
@@ -148,7 +148,7 @@ def _timed(dataset: Dataset, numbers: Sequence[Sequence[int]], frame_times: str 
             replace(sequence, arrival_ns=arrivals(own, dataset.fps))
             for sequence, own in zip(sequences, numbers)
         ]
-    notes = [*dataset.notes, note(gaps, frame_times)]
+    notes = (*dataset.notes, note(gaps, frame_times))
     return replace(dataset, sequences=sequences, notes=notes, frame_times=frame_times)
 
 
