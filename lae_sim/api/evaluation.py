@@ -119,7 +119,7 @@ class Scenario:
             if sequences:
                 rows.add(part)
         notes = notes_on(totals.replay, metadata, convention, self.forecasters)
-        notes += [*stalls.notes(), *cost_notes(self.costs)]
+        notes += [*self.runs.notes(), *stalls.notes(), *cost_notes(self.costs)]
         return Evaluated(self, totals, rows, tuple(notes))
 
 
@@ -161,6 +161,7 @@ class Evaluated:
             "times_from": path if runs.timing is None else path_of(runs.timing) or "an open trace",
             "times_note": runs.times.metadata.timing_note,
             "fps": str(runs.clock.fps),
+            "arrivals": runs.arrivals,
             "policy": label_of(world.policy),
             "latency": label_of(world.latency),
             "latency_scale": str(world.scale),
@@ -557,6 +558,7 @@ def evaluate(
     dataset: str | None = None,
     camera_lag: int | None = None,
     progress: bool | None = None,
+    forget_arrivals: bool = False,
 ) -> EvaluationResult:
     """Replay traces and score them, latency counted.
 
@@ -588,6 +590,8 @@ def evaluate(
         root, dataset, camera_lag: the frames, for ``camera+NAME`` (see
             :func:`lae_sim.learning.registry.find_camera`).
         progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        forget_arrivals: let frames arrive evenly also where a trace says when each of them did,
+            which is needed for another rate.
 
     Raises:
         LaeError: if an argument is impossible, a file is missing, or a frame is asked for that a
@@ -613,6 +617,7 @@ def evaluate(
         search=search,
         pre_forecaster=pre_forecaster,
         keep_size=keep_size,
+        forget_arrivals=forget_arrivals,
         sigma=sigma,
         convention=convention,
         forecasters=makers,

@@ -118,6 +118,7 @@ def _compare(arguments: argparse.Namespace) -> None:
         search=arguments.search,
         pre_forecaster=arguments.pre_forecaster,
         keep_size=arguments.keep_size,
+        forget_arrivals=arguments.forget_arrivals,
         convention=arguments.convention,
         costs=arguments.cost,
         sequences=arguments.sequence,

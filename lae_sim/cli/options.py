@@ -48,6 +48,16 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
     add_passes(add)
 
 
+def add_frame_times(add: Callable[..., argparse.Action]) -> None:
+    """Add when frames come among whose images numbers are missing, by what adds to a group."""
+    add(
+        "--frame-times",
+        choices=("numbers", "even"),
+        help="where image numbers are missing, as if a camera had dropped frames: let each image "
+        "come at the time of its number, or one after another (default: such images are refused)",
+    )
+
+
 def add_passes(add: Callable[..., argparse.Action]) -> None:
     """Add further passes of the tracker, by what adds to a parser or a group."""
     add(
@@ -130,6 +140,11 @@ def _world_group(
         type=argument(parse_fps),
         **({"nargs": "+", "default": []} if sweeps else {}),
         help="world frame rate, exact (default: the trace's)" + (several if sweeps else ""),
+    )
+    add(
+        "--forget-arrivals",
+        action="store_true",
+        help="let frames arrive evenly also where the trace says when each of them did",
     )
     add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
     return add
@@ -331,5 +346,6 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
         search=getattr(arguments, "search", "off"),
         pre_forecaster=getattr(arguments, "pre_forecaster", None),
         keep_size=getattr(arguments, "keep_size", False),
+        forget_arrivals=arguments.forget_arrivals,
         **scores,
     )

@@ -10,7 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.cli.options import argument, exit_status, new_parser, parse_box, print_json
+from lae_sim.cli.options import (
+    add_frame_times,
+    argument,
+    exit_status,
+    new_parser,
+    parse_box,
+    print_json,
+)
 from lae_sim.engine.clock import parse_budget, parse_duration, parse_fps, parse_stride, whole
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.plugins import key_and_value
@@ -99,6 +106,7 @@ def parser() -> argparse.ArgumentParser:
     add("--sequence", nargs="+", action="extend", metavar="NAME", help="these sequences only")
     add("--box", type=argument(parse_box), metavar="X,Y,W,H", help="first box, for a video")
     add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the dataset's)")
+    add_frame_times(add)
     group = made.add_argument_group("the run")
     add = group.add_argument
     add(
@@ -204,6 +212,7 @@ def _profile(arguments: argparse.Namespace, failed: list[Any]) -> None:
         sequences=arguments.sequence,
         box=arguments.box,
         fps=arguments.fps,
+        frame_times=arguments.frame_times,
         mode=arguments.mode,
         policy=arguments.policy,
         pre_forecaster=arguments.pre_forecaster,

@@ -122,7 +122,8 @@ def _images(run: Run, metadata: Metadata, arguments: argparse.Namespace) -> Imag
     root = None if arguments.root is None else Path(arguments.root).expanduser()
     box = run.recording.truth[0] if root is not None and root.is_file() else None
     sequences = None if box is not None else [run.recording.name]
-    return find_dataset(name, root, sequences, box).sequences[0]
+    # the trace knows when its frames came
+    return find_dataset(name, root, sequences, box, frame_times="even").sequences[0]
 
 
 def _sheet(scene: Scene, frames: Sequence[int], path: Path) -> None:

@@ -31,6 +31,8 @@ conventions are crossed:
   forecasters = ["hold", "kalman"]       as in compare
   policies = ["latest"]                  as in replay
   fps = ["trace", 60]                    world frame rates; "trace" is each trace's own
+  forget_arrivals = false                whether frames arrive evenly also where a trace says when
+                                         each of them did
   latencies = ["recorded", "bootstrap"]  also by-call, constant:47ms; bootstrap (in blocks),
                                          resample and lognormal are drawn anew in each repetition
   passes = ["nano.gaps.parquet"]         strided and gap passes, for traces of their tracker and

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lae_sim._arrays import Bools, Floats
+from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.errors import LaeError
 
 _THREADS = 4
@@ -36,6 +36,8 @@ class ImageSequence:
         attributes: the dataset's attributes of the sequence, such as ``"Occlusion"``.
         visible: False where the dataset says that the target is absent or fully covered, bool [T];
             None = it says nothing.
+        arrival_ns: when each frame arrives, ns after the first, int64 [T], ascending from 0; None =
+            at the dataset's frame rate.
     """
 
     name: str
@@ -43,6 +45,7 @@ class ImageSequence:
     read: Callable[[int], Image]
     attributes: tuple[str, ...] = ()
     visible: Bools | None = None
+    arrival_ns: Ints | None = None
 
     def __len__(self) -> int:
         """Number of frames T."""
@@ -60,13 +63,16 @@ class Dataset:
         name: the dataset's name, such as ``"DTB70"``.
         fps: its frame rate, frames per second, exact.
         sequences: sorted by name.
-        notes: which files beside the images and the truth could not be read, and why.
+        frame_times: how frames come where image numbers are missing: ``"numbers"`` or ``"even"``;
+            None where none is.
+        notes: what a user should know of them, and what was left out, a sentence each.
     """
 
     name: str
     fps: Fraction
     sequences: Sequence[ImageSequence]
-    notes: Sequence[str] = ()
+    frame_times: str | None = None
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"<Dataset {self.name!r}: {len(self.sequences)} sequences at {self.fps} fps>"

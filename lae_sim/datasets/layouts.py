@@ -21,6 +21,7 @@ import numpy as np
 from lae_sim._arrays import Floats
 from lae_sim.datasets.absence import read_visible
 from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
+from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, image_number, missing, note
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.synthetic import synthetic_dataset
 from lae_sim.engine.clock import Number, parse_fps
@@ -63,6 +64,7 @@ def find_dataset(
     sequences: str | Sequence[str] | None = None,
     box: Sequence[float] | None = None,
     fps: Number | None = None,
+    frame_times: str | None = None,
 ) -> Dataset:
     """Find a dataset's images and ground truth.
 
@@ -76,6 +78,9 @@ def find_dataset(
         box: the first box ``x, y, w, h`` in pixels, for images or a video without ground truth.
         fps: frames per second; by default the dataset's (30, or 10 for UAV123_10fps and GOT-10k)
             or the video's own. Of NfS it chooses the set, of 30 or 240.
+        frame_times: where numbers are missing among a sequence's images, as if the camera had
+            dropped frames: ``"numbers"`` lets each image come at the time of its number, ``"even"``
+            one after another. Without it such images are refused.
 
     Returns:
         The dataset. Where only the first box is known, the truth after it is NaN.
@@ -93,6 +98,7 @@ def find_dataset(
     """
     sequences = None if sequences is None else sequence_names(sequences)
     fps = None if fps is None else parse_fps(fps)
+    check_frame_times(frame_times)
     if box is not None and len(box) != 4:
         raise LaeError(f"box: x, y, w, h in pixels, not {shown(box)}")
     if not isinstance(root, (str, os.PathLike, type(None))):
@@ -107,7 +113,7 @@ def find_dataset(
         return Dataset("synthetic", fps or Fraction(30), [synthetic[name] for name in chosen])
     root = Path(root)
     if root.is_file() or box is not None:
-        return _without_truth(name, root, sequences, box, fps)
+        return _without_truth(name, root, sequences, box, fps, frame_times)
     name = _SPELLINGS.get((name or "").lower(), name)
     named = root / "anno" / name if name else root
     truth = find_truth(named if named.is_dir() else root, fps)
@@ -115,17 +121,35 @@ def find_dataset(
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
-    chosen_sequences = [
-        _sequence(root, sequence, truth.files[sequence], attributes.of.get(sequence, ()))
-        for sequence in _choose(sequences, truth.files, str(root), truth.match)
-    ]
-    notes = [*attributes.notes]
-    for i, sequence in enumerate(chosen_sequences):
-        visible, note = read_visible(truth.files[sequence.name], len(sequence))
-        chosen_sequences[i] = replace(sequence, visible=visible)
-        notes += [f"sequence {sequence.name!r}: {note}"] if note else []
+    found, notes = [], list(attributes.notes)
+    for each in _choose(sequences, truth.files, str(root), truth.match):
+        file = truth.files[each]
+        sequence, numbers = _sequence(root, each, file, attributes.of.get(each, ()))
+        visible, left_out = read_visible(file, len(sequence))
+        found.append((replace(sequence, visible=visible), numbers))
+        notes += [f"sequence {each!r}: {left_out}"] if left_out else []
     fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
-    return Dataset(name, fps, chosen_sequences, notes)
+    return _timed(name, fps, found, frame_times, notes)
+
+
+def _timed(
+    name: str,
+    fps: Fraction,
+    sequences: Sequence[tuple[ImageSequence, Sequence[int]]],
+    frame_times: str | None,
+    notes: Sequence[str] = (),
+) -> Dataset:
+    """The dataset of sequences with the numbers of their images."""
+    made = [sequence for sequence, _ in sequences]
+    gaps = [(sequence.name, numbers) for sequence, numbers in sequences if missing(numbers)]
+    if not gaps:
+        return Dataset(name, fps, made, notes=tuple(notes))
+    if frame_times is None:
+        raise ask(*gaps[0], fps)
+    if frame_times == "numbers":  # of all: a trace has the times of every frame, or of none
+        made = [replace(each, arrival_ns=arrivals(numbers, fps)) for each, numbers in sequences]
+    of_gaps = note((gap for gap, _ in gaps), frame_times)
+    return Dataset(name, fps, made, frame_times, (*notes, of_gaps))
 
 
 def _without_truth(
@@ -134,6 +158,7 @@ def _without_truth(
     sequences: Sequence[str] | None,
     box: Sequence[float] | None,
     fps: Fraction | None,
+    frame_times: str | None,
 ) -> Dataset:
     """A video or a folder of images of which only the first box is known."""
     sequence = root.resolve().stem if root.is_file() else root.resolve().name
@@ -141,6 +166,7 @@ def _without_truth(
     if box is None:
         raise LaeError(f"{root}: a video needs the target's first box: --box x,y,w,h")
     read: Callable[[int], Image]
+    numbers: Sequence[int] = ()
     if root.is_file():
         read = video = Video(root)
         length, fps = len(video), fps or video.fps
@@ -153,11 +179,16 @@ def _without_truth(
         if not paths:
             raise LaeError(f"{root}: no images there; --box needs a folder of images, or a video")
         read, length = partial(_read, sequence, paths), len(paths)
+        numbers = _numbers(paths)
     truth = _only_first(np.array([box], np.float64), length)
-    return Dataset(name or sequence, fps or Fraction(30), [ImageSequence(sequence, truth, read)])
+    images = [(ImageSequence(sequence, truth, read), numbers)]
+    return _timed(name or sequence, fps or Fraction(30), images, frame_times)
 
 
-def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) -> ImageSequence:
+def _sequence(
+    root: Path, name: str, file: Path, attributes: tuple[str, ...]
+) -> tuple[ImageSequence, Sequence[int]]:
+    """A sequence, and the numbers of its images."""
     paths, first = _find_images(root, name, file)
     truth = read_truth(file, len(paths))
     if len(truth) == 1:
@@ -170,7 +201,8 @@ def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) ->
             f"sequence {name!r}: {len(paths)} images in {paths[0].parent}, but {len(truth)} "
             f"annotations in {file}"
         )
-    return ImageSequence(name, truth, partial(_read, name, paths), attributes)
+    made = ImageSequence(name, truth, partial(_read, name, paths), attributes)
+    return made, _numbers(paths)
 
 
 def _find_images(root: Path, name: str, file: Path) -> tuple[list[Path], int | None]:
@@ -192,6 +224,27 @@ def _find_images(root: Path, name: str, file: Path) -> tuple[list[Path], int | N
     )
 
 
+def image_numbers(root: Path, name: str, file: Path, length: int) -> list[int]:
+    """The numbers of a sequence's images, where they are beside its ground truth; else none.
+
+    Args:
+        root: the dataset's folder.
+        name: the sequence's.
+        file: its ground truth.
+        length: number of frames.
+    """
+    try:
+        paths, first = _find_images(root, name, file)
+    except LaeError:
+        return []
+    numbers = _numbers(paths)
+    if len(numbers) > length:
+        first = first or _OTB_FIRST.get((name, length))
+        start = numbers.index(first) if first in numbers else 0
+        numbers = numbers[start : start + length]
+    return numbers if len(numbers) == length else []
+
+
 def _clip_first(file: Path) -> int:
     """The number of the first image of one of UAV123's clips, from the lengths before it."""
     first = _CLIP_FIRST.get(file.stem)
@@ -206,7 +259,7 @@ def _clip_first(file: Path) -> int:
 
 def _part(paths: list[Path], first: int | None, length: int, where: str) -> list[Path]:
     """``length`` images from number ``first``, or from the start; none may be missing between."""
-    numbers = [int("".join(re.findall("[0-9]+", path.stem)[-1:]) or -1) for path in paths]
+    numbers = _numbers(paths)
     if first is not None:
         if first not in numbers:
             raise LaeError(f"{where}: no image number {first}, where the sequence starts")
@@ -217,6 +270,10 @@ def _part(paths: list[Path], first: int | None, length: int, where: str) -> list
         gap = numbers[int(np.argmax(steps != 1))]
         raise LaeError(f"{where}: the image after number {gap} is missing, or there twice")
     return paths[:length]
+
+
+def _numbers(paths: Sequence[Path]) -> list[int]:
+    return [image_number(path.stem) for path in paths]
 
 
 def _list_images(folder: Path) -> list[Path]:

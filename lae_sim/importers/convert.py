@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ import numpy as np
 from lae_sim._arrays import Ints
 from lae_sim.datasets.absence import absence_files, read_visible
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
+from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing
+from lae_sim.datasets.layouts import image_numbers
 from lae_sim.engine.clock import Clock, Number, parse_fps
 from lae_sim.errors import LaeError, listed, shown
 from lae_sim.importers.coordinates import other_reading, row_0_is_off
@@ -50,6 +53,9 @@ class ConversionSummary:
         timing: where the times come from: ``source``, and a ``note`` if some were changed.
         sequences, frames, processed: how many; a frame is processed where it has a time.
         median_ms: median time of a processed frame, ms.
+        frame_times: how frames come where image numbers are missing: ``"numbers"`` or ``"even"``;
+            None where none is, or no images are at hand.
+        numbers_missing: the sequences where some are.
         row_0_from_truth: sequences whose row 0 was more than 3 px off the initial box, from which
             the tracker started; in the trace it is that box.
         without_truth: results that were left out, since they have no ground truth.
@@ -68,6 +74,8 @@ class ConversionSummary:
     frames: int
     processed: int
     median_ms: float
+    frame_times: str | None
+    numbers_missing: list[str]
     row_0_from_truth: list[str]
     without_truth: list[str]
     without_results: list[str]
@@ -98,6 +106,7 @@ def convert_results(
     truth_files: Mapping[str, str | Path] | None = None,
     skip_missing: bool = False,
     image_size: tuple[int, int] | None = None,
+    frame_times: str | None = None,
     progress: Progress = lambda done, total: None,
 ) -> tuple[Trace, ConversionSummary]:
     """Make a trace from a tracker's results and the dataset's ground truth.
@@ -119,6 +128,8 @@ def convert_results(
         truth_files: other ground truth for some sequences, by name.
         skip_missing: whether results without ground truth are left out instead of refused.
         image_size: width and height of the images, pixels.
+        frame_times: where images are beside the ground truth and numbers are missing among them
+            (see :func:`lae_sim.datasets.layouts.find_dataset`).
         progress: called after each sequence.
 
     Returns:
@@ -146,6 +157,7 @@ def convert_results(
     for name, path in (("results", results), ("truth", truth)):
         if not isinstance(path, (str, os.PathLike)):
             raise LaeError(f"{name}: a path, not {shown(path)}")
+    check_frame_times(frame_times)
     if repetition < 1:
         raise LaeError("--repetition counts from 1")
     results = Path(results)
@@ -179,14 +191,22 @@ def convert_results(
         recordings, timing = _every_frame(matched, annotations, read, given, progress)
     as_published = recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
-    recordings, notes = _flagged(recordings, annotations)
     attributes = read_attributes(annotations)
+    recordings, notes = _flagged(recordings, annotations)
+    incomplete: list[str] = []
+    if kind != "lae-pvt":  # whose recorded loop took the frames evenly, whatever their numbers
+        recordings, incomplete = _arrived(recordings, annotations, clock.fps, frame_times)
+    elif frame_times == "numbers":
+        raise LaeError(
+            "--frame-times numbers does not go with lae-pvt: its runs took frames evenly"
+        )
+    frame_times = frame_times if incomplete else None
     metadata = Metadata.new(
         rate,
         **schedule,
         tracker={"name": tracker},
         device={"model": device} if device else {},
-        dataset={"name": dataset},
+        dataset={"name": dataset, **({"frame_times": frame_times} if frame_times else {})},
         timing=timing,
         sequences=_sequence_entries(matched, attributes.of, image_size),
     )
@@ -203,6 +223,8 @@ def convert_results(
         frames=len(elapsed),
         processed=int((elapsed >= 0).sum()),
         median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
+        frame_times=frame_times,
+        numbers_missing=incomplete,
         row_0_from_truth=[
             new.name for new, old in zip(recordings, as_published) if new.boxes is not old.boxes
         ],
@@ -374,6 +396,30 @@ def _flagged(
             "them out",
         )
     return flagged, notes
+
+
+def _arrived(
+    recordings: list[Recording], truth: GroundTruth, fps: Fraction, frame_times: str | None
+) -> tuple[list[Recording], list[str]]:
+    """The recordings with the times of their frames, and in which image numbers are missing.
+
+    Raises:
+        LaeError: if some are, and it is not said how the frames come.
+    """
+    numbers = {
+        each.name: image_numbers(truth.root, each.name, truth.files[each.name], len(each))
+        for each in recordings
+    }
+    incomplete = [name for name, known in numbers.items() if missing(known)]
+    if incomplete and frame_times is None:
+        raise ask(incomplete[0], numbers[incomplete[0]], fps)
+    if not incomplete or frame_times == "even":
+        return recordings, incomplete
+    placed = [  # all of them: a trace has the times of every frame, or of none
+        replace(each, arrival_ns=arrivals(numbers[each.name] or range(len(each)), fps))
+        for each in recordings
+    ]
+    return placed, incomplete
 
 
 def _sequence_entries(

@@ -336,12 +336,14 @@ class Gaps:
 
     def _live(self, start: Start, sequence: ImageSequence, read: Callable[[int], Image]) -> Live:
         first = start.name.start
-        frames = slice(first, first + start.frames[-1] + 1)
+        rows = slice(first, first + start.frames[-1] + 1)
+        arrived = None if sequence.arrival_ns is None else sequence.arrival_ns[rows]
         part = ImageSequence(
             str(start.name),
-            sequence.truth[frames],
+            sequence.truth[rows],
             lambda frame: read(first + frame),
-            visible=None if sequence.visible is None else sequence.visible[frames],
+            visible=None if sequence.visible is None else sequence.visible[rows],
+            arrival_ns=None if arrived is None else arrived - arrived[0],
         )
         return Live(part, **self._options)
 

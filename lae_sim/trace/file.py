@@ -79,6 +79,12 @@ class Trace:
             return tuple(self.recordings.lengths())
         return tuple(recording.name for recording in self.recordings)
 
+    @property
+    def has_arrivals(self) -> bool:
+        """Whether it says when each frame arrived."""
+        known = self.recordings if isinstance(self.recordings, Sequence) else ()
+        return "arrival_ns" in self.columns or any(r.arrival_ns is not None for r in known)
+
     def chosen(self, sequences: str | Iterable[str]) -> Trace:
         """The trace with some of its sequences only; of a file their names alone are read.
 

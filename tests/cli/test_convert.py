@@ -87,6 +87,8 @@ def test_json(world, convert):
         "frames": 6,
         "processed": 6,
         "median_ms": 20.0000005,
+        "frame_times": None,
+        "numbers_missing": [],
         "row_0_from_truth": [],
         "without_truth": [],
         "without_results": [],

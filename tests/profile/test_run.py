@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from lae_sim.api.evaluation import evaluate
 from lae_sim.comparison.fidelity import compare_closed_loops, summarise_closed_loops
 from lae_sim.errors import LaeError
 from lae_sim.profile.passes import Failure
@@ -121,6 +122,27 @@ def test_a_profile_shows_its_progress_and_says_what_to_know(
     again = profile_tracker("dcf", out=out, progress=True, resume=True, **QUICK)
     assert "nothing to resume" in capsys.readouterr().err
     assert repr(again) == "<Profile: nothing was left to do>"
+
+
+def test_images_that_change_size(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2", reason="frames are decoded with OpenCV")
+    folder = tmp_path / "data" / "car"
+    (folder / "img").mkdir(parents=True)
+    for frame in range(9):
+        width, height = (160, 120) if frame < 5 else (100, 90)
+        image = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+        cv2.imwrite(str(folder / "img" / f"{frame}.png"), image[:height, :width])
+    (folder / "groundtruth_rect.txt").write_text("40,30,30,20\n" * 9)
+    notes: list[str] = []
+    plan = ProfilePlan.of(tracker="dcf", root=tmp_path / "data", in_process=True, strides=[2])
+    profile = run_profile(plan, tmp_path / "dcf.parquet", notice=notes.append)
+    assert "images of 1 sequences change size, such as those of 'car'" in notes[-1]
+    for summary in profile.traces:
+        entry = read_trace(summary.trace).metadata.document["sequences"]["car"]
+        assert entry["image_size"] == [160, 120]
+        assert entry["image_sizes"] == [[0, 160, 120], [5, 100, 90]]
+    result = evaluate(tmp_path / "dcf.parquet", forecasters="kalman-lae-pvt")
+    assert any("images of 1 of 1 sequences change size" in note for note in result.notes)
 
 
 def test_a_failure_shows_in_html_as_text() -> None:
