@@ -302,8 +302,8 @@ def run_profile(
     for sequence in dataset.sequences:
         if fault := text_fault(sequence.name):
             raise LaeError(f"sequence {sequence.name!r}: the name {fault}: rename it")
-    for note in dataset.notes:
-        notice(f"note: {note}")
+    for said in dataset.notes:
+        notice(said)
     failures: dict[str, list[Failure]] = {}
     interrupted = False
     with closing(_start(plan, notice)) as started:
