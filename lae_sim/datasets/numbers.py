@@ -79,6 +79,11 @@ def read_cells(
         else:
             width = len(row)
         rows.append(row)
+    if _are_decimal_commas(rows):
+        raise LaeError(
+            f"{path}, line 1: {','.join(rows[0])!r:.40} looks like a number with a decimal "
+            "comma; write decimal points"
+        )
     width = width or max(map(len, rows))
     for index in no_target:
         rows[index] = ["nan"] * width
@@ -109,6 +114,13 @@ def read_numbers(
                 + ("; the line looks like a header: remove it" if header else "")
             )
     return table
+
+
+def _are_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether two columns look like one of numbers such as 0,047 rather than two of whole ones."""
+    if not all(len(row) == 2 and row[0].isdigit() and row[1].isdigit() for row in rows):
+        return False
+    return all(row[0] == "0" for row in rows) or any(re.match("0[0-9]", row[1]) for row in rows)
 
 
 def _is_header(rows: Sequence[Sequence[str]]) -> bool:

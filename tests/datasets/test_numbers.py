@@ -52,6 +52,9 @@ def test_separators(written, text):
         ("1,5;2,5\n", 1, "decimal points, and one separator"),
         ("1,5 2,5\n", 1, "decimal points, and one separator"),
         ("1,2\n10\t2,5\n", 2, "decimal points, and one separator"),
+        ("0,047\n0,2\n", 1, "'0,047' looks like a number with a decimal comma"),
+        ("0,147\n0,2\n", 1, "write decimal points"),
+        ("1,5\n12,05\n", 1, "write decimal points"),
         ("x,y\n1,2\n", 1, "'x' is not a number; the line looks like a header: remove it"),
     ],
 )
