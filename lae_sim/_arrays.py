@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import numpy.typing as npt
 
@@ -12,3 +14,7 @@ Bools = npt.NDArray[np.bool_]
 
 
 Ints = npt.NDArray[np.int64]
+
+
+Count = TypeVar("Count", int, Ints)
+"""Frames or ticks: a number, or int64 [n]."""

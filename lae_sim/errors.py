@@ -7,9 +7,15 @@ import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+_SCREEN = 1200
+"""Characters of an error that are read at a glance: some 15 lines of a terminal."""
+
 
 class LaeError(Exception):
     """An input or a setting that cannot be used; the message says where and what to do.
+
+    As text it is one line that a terminal can show: with control characters as :func:`visible`
+    writes them, and of a very long message its beginning and its end.
 
     Example:
         >>> import lae_sim
@@ -19,6 +25,9 @@ class LaeError(Exception):
         ...     print(error)
         latency: '47' is not a duration: write it with its unit, such as 47ms
     """
+
+    def __str__(self) -> str:
+        return abridged(visible(super().__str__()))
 
 
 class TraceError(LaeError):
@@ -59,6 +68,43 @@ def shown(value: object) -> str:
     except Exception:  # more digits than Python writes, or nested too deeply
         text = f"a value of type {type(value).__name__}"
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def visible(text: object, keep: str = "") -> str:
+    r"""Text whose control characters, which a terminal would obey, are seen as escapes.
+
+    So are marks that turn the direction of writing, and halves of characters, which no file can
+    hold.
+
+    Args:
+        text: what a file, a name or another program's error holds.
+        keep: characters that stay, such as line breaks.
+
+    Example:
+        >>> print(visible("car\x1b[2J\u202e"))
+        car\x1b[2J\u202e
+    """
+    text = str(text)
+    if text.isprintable():
+        return text
+    return "".join(
+        c if c.isprintable() or c in keep else c.encode("unicode_escape").decode() for c in text
+    )
+
+
+def abridged(text: str, most: int = _SCREEN) -> str:
+    """A text of at most so many characters: of a longer one, its beginning and its end."""
+    if len(text) <= most:
+        return text
+    end = most // 4
+    return f"{text[: most - end - 5]} ... {text[-end:]}"
+
+
+def listed(names: Iterable[object], most: int = 5) -> str:
+    """Names, each of at most 60 characters: some of them, and how many more there are."""
+    texts = [abridged(str(name), 60) for name in names]
+    more = f" and {len(texts) - most:,} more" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + more
 
 
 def hint(name: object, known: Iterable[str]) -> str:

@@ -6,15 +6,17 @@ import hashlib
 import math
 import os
 import re
+import stat
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, shown, visible
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -220,9 +222,25 @@ def text_digest(text: str) -> str:
 
 
 def labels(paths: Sequence[str]) -> list[str]:
-    """File names, where they tell the files apart; otherwise the paths."""
-    names = [Path(path).name for path in paths]
-    return names if len(set(names)) == len(names) else list(paths)
+    """File names, where they tell the files apart; otherwise the paths. All can be printed."""
+    names = [visible(Path(path).name) for path in paths]
+    return names if len(set(names)) == len(names) else [visible(path) for path in paths]
+
+
+def csv_cell(value: Any) -> Any:
+    """A value as a cell of a CSV file, of which no spreadsheet makes a formula.
+
+    A text that begins with one of ``= + - @ '``, a tab or a line break has an apostrophe before it
+    (a recipe of OWASP, "CSV Injection"), unless it is a number; one apostrophe taken from the front
+    of a cell gives the text back. All other values stay what they are.
+    """
+    if not isinstance(value, str) or not value.startswith(("=", "+", "-", "@", "'", *"\t\r\n")):
+        return value
+    try:
+        Fraction(value)
+    except (ValueError, ZeroDivisionError):
+        return f"'{value}"
+    return value
 
 
 def sequence_names(sequences: str | Iterable[str]) -> list[str]:
@@ -240,6 +258,21 @@ def sequence_names(sequences: str | Iterable[str]) -> list[str]:
     if not names:
         raise LaeError("sequences: name at least one")
     return names
+
+
+def check_regular(path: str | os.PathLike[str]) -> None:
+    """Refuse to read what is there but no file, such as a pipe, which might never end.
+
+    Raises:
+        LaeError: if it is a folder, a pipe, a socket or a device.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return  # which reading it will tell
+    if not stat.S_ISREG(mode):
+        what = "folder" if stat.S_ISDIR(mode) else "pipe" if stat.S_ISFIFO(mode) else "device"
+        raise LaeError(f"{path}: a {what}, not a file: write it to a file, and give that")
 
 
 def check_folders(paths: Iterable[str]) -> None:

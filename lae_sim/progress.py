@@ -1,21 +1,68 @@
-"""The progress bar of what takes long."""
+"""What a command says while and after it works: lines, and the progress bar of what takes long.
+
+All that is printed goes through here, where nothing that a file holds can move the cursor, change
+what stands on the screen, or fail for want of a letter.
+"""
 
 from __future__ import annotations
 
 import sys
 import warnings
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
+
+from lae_sim.errors import LaeError, abridged, visible
 
 SOON_S = 0.5
 """What is done sooner shows no bar, unless it is asked for."""
 
 
-def tell(text: str, end: str = "\n") -> None:
-    """Write to the standard error stream; where nobody reads it any more, the work goes on."""
+def tell(text: str, end: str = "\n", keep: str = "\n") -> None:
+    """Write to the standard error stream; where nobody reads it any more, the work goes on.
+
+    Args:
+        text: what there is to say.
+        end: what follows it.
+        keep: control characters that are meant to do what they do.
+    """
     if sys.stderr is not None:  # print would take the standard output
         with suppress(OSError, ValueError):  # ValueError: it is closed
-            print(text, end=end, file=sys.stderr, flush=True)
+            print(visible(text, keep), end=end, file=sys.stderr, flush=True)
+
+
+class OutputError(LaeError):
+    """What was to be printed could not be; nobody has seen it."""
+
+
+def print_text(text: str, end: str = "\n") -> None:
+    """Write to the standard output; what its encoding has not is replaced by question marks.
+
+    Raises:
+        BrokenPipeError: if nobody reads it any more.
+        OutputError: if it takes no more for another reason, such as a full disk.
+    """
+    if sys.stdout is None:
+        return
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    shown = visible(text, keep="\n").encode(encoding, "replace").decode(encoding)
+    with printing():
+        print(shown, end=end)
+
+
+@contextmanager
+def printing() -> Iterator[None]:
+    """Say what is amiss where the standard output takes no more.
+
+    Raises:
+        BrokenPipeError, OutputError: see :func:`print_text`.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(f"the standard output: {error.strerror or error}") from error
 
 
 class ProgressBar:
@@ -33,7 +80,7 @@ class ProgressBar:
     """
 
     def __init__(self, title: str, unit: str, show: bool | None = None) -> None:
-        self._title, self._unit = str(title), unit
+        self._title, self._unit = abridged(visible(title), 60), unit
         self.shown = _somebody_looks() if show is None else show
         self._delay = 0.0 if show else SOON_S
         self._bar: Any = None
@@ -51,7 +98,7 @@ class ProgressBar:
                 delay=self._delay,
             )
         if what:
-            self._bar.set_description(what, refresh=False)
+            self._bar.set_description(abridged(visible(what), 60), refresh=False)
         self._bar.total = total
         self._bar.update(done - self._bar.n)
 

@@ -215,6 +215,8 @@ JSON = st.recursive(
         st.fixed_dictionaries({"kind": inner}),
         st.fixed_dictionaries({"a": inner, "b": inner}),
         st.fixed_dictionaries({"image_size": inner, "attributes": inner}),
+        st.fixed_dictionaries({"image_size": st.just([64, 36]), "image_sizes": inner}),
+        st.lists(st.lists(st.integers(0, 64), min_size=3, max_size=3), max_size=3),
         st.fixed_dictionaries({"name": inner, "model": inner, "source": inner}),
     ),
     max_leaves=8,
@@ -230,8 +232,10 @@ def exercise(metadata: Metadata) -> None:
     assert metadata.fps > 0
     for name in ("a", "b", "c"):
         assert all(isinstance(attribute, str) for attribute in metadata.attributes(name))
-        size = metadata.image_size(name)
+        size, sizes = metadata.image_size(name), metadata.image_sizes(name)
         assert size is None or (min(size) > 0 and all(type(side) is int for side in size))
+        assert (None if sizes is None else sizes.at(0)) == size
+        assert name not in metadata.resized or (sizes is not None and sizes.change)
     assert Metadata.parse(metadata.dumps()) == metadata
 
 
@@ -314,6 +318,12 @@ HOSTILE = [
     ),
     json.dumps({**MINIMAL, "sequences": {"a": {"image_size": [10**400, 1]}}}).encode(),
     json.dumps({**MINIMAL, "sequences": {"a": {"image_size": [1, 1]}}}).encode(),
+    json.dumps(
+        {
+            **MINIMAL,
+            "sequences": {"a": {"image_size": [1, 1], "image_sizes": [[0, 1, 1], [5, 2, 2]]}},
+        }
+    ).encode(),
     json.dumps({**MINIMAL, "sequences": {"\ud800": {"attributes": ["\ud800"]}}}).encode(),
     json.dumps(
         {**MINIMAL, "tracker": {"name": {"a": [None]}}, "device": {"model": 1e300}}

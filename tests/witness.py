@@ -281,11 +281,15 @@ def follow(psis: Sequence[int], boxes: Sequence[Box], make: Callable[[Box], Any]
 
 
 def scores(
-    truth: Sequence[Box | None], answers: Sequence[Box], convention: str, number: Any = Fraction
+    truth: Sequence[Box | None],
+    answers: Sequence[Box],
+    convention: str,
+    number: Any = Fraction,
+    visible: Sequence[bool] | None = None,
 ) -> dict[str, Any]:
     """AUC and DP of one sequence by the table of DESIGN 5; None = the sequence leaves the mean."""
     steps = 100 if convention == "got10k-101" else 20
-    leaves_out = convention in ("got10k", "got10k-101", "exclude")
+    leaves_out = convention in ("lasot", "got10k", "got10k-101", "exclude")
     passed = [0] * (steps + 1)
     near = [0] * 51
     counted = 0
@@ -308,9 +312,11 @@ def scores(
             valid = min(box) > 0
         else:
             valid = True
+        if convention == "lasot" and visible is not None and not visible[i]:
+            valid = False
+        counted += valid or not leaves_out or convention == "lasot"
         if not valid and leaves_out:
             continue
-        counted += 1
         if valid:
             iou = overlap(box, told)
             for k in range(steps + 1):
@@ -466,11 +472,17 @@ def write_plain(
 
 def same(a: Recording, b: Recording) -> bool:
     """Whether two recordings are equal bit for bit."""
-    return a.name == b.name and all(
+    optional = ("arrival_ns", "visible")
+    if a.name != b.name or any(
+        (getattr(a, o) is None) != (getattr(b, o) is None) for o in optional
+    ):
+        return False
+    present = [field for field in optional if getattr(a, field) is not None]
+    return all(
         getattr(a, field).dtype == getattr(b, field).dtype
         and getattr(a, field).shape == getattr(b, field).shape
         and getattr(a, field).tobytes() == getattr(b, field).tobytes()
-        for field in ("truth", "boxes", "elapsed_ns", "score")
+        for field in ("truth", "boxes", "elapsed_ns", "score", *present)
     )
 
 

@@ -26,6 +26,9 @@ TYPES: Types = {
     **{name: pa.float64() for name in ("truth_x", "truth_y", "truth_w", "truth_h", *"xywh")},
     "elapsed_ns": pa.int64(),
     "score": pa.float32(),
+    "arrival_ns": pa.int64(),
+    "visible": pa.bool_(),
+    "stage_decode_ns": pa.int64(),
 }
 DOCUMENT: Document = {
     "format": "lae-trace",
@@ -34,7 +37,8 @@ DOCUMENT: Document = {
     "schedule": {"kind": "every-frame"},
 }
 
-RESTARTS: Document = {**DOCUMENT, "version": "1.1", "schedule": {"kind": "restarts"}}
+NEWER: Document = {**DOCUMENT, "version": "1.1"}
+RESTARTS: Document = {**NEWER, "schedule": {"kind": "restarts"}}
 
 
 def good() -> Columns:
@@ -102,6 +106,19 @@ def restarts(*names: str) -> Columns:
     return columns
 
 
+def arriving(*changes: tuple[int, Any]) -> Columns:
+    """The good columns with the times at which frames arrived: frame 2 late, 3 after a gap."""
+    times = [0, 33_333_333, 69_000_000, 166_666_667] * 2
+    for row, value in changes:
+        times[row] = value
+    return {**good(), "arrival_ns": times}
+
+
+def flagged(*flags: Any) -> Columns:
+    """The good columns with flags of the frames of ``a``; nothing is said of ``b``."""
+    return {**good(), "visible": [*flags, *[None] * 4]}
+
+
 def no_truth() -> Columns:
     """Truth that is missing in two frames."""
     columns = good()
@@ -145,6 +162,11 @@ def write_valid(folder: Path) -> None:
     write(folder / "missing-truth.parquet", no_truth())
     write(folder / "no-truth-columns.parquet", without("truth_x", "truth_y", "truth_w", "truth_h"))
     write(folder / "no-score-column.parquet", without("score"))
+    write(folder / "arrivals.parquet", arriving(), NEWER)
+    write(folder / "flags-of-absence.parquet", flagged(True, None, False, True), NEWER)
+    stages = {"stage_decode_ns": [None, *range(1_000_000, 1_000_007)]}
+    write(folder / "all-of-1.1.parquet",
+          {**flagged(True, True, True, False), **arriving(), **stages}, NEWER)  # fmt: skip
     write(folder / "zero-time.parquet", mapped(lambda _: 0, "elapsed_ns"))
     write(folder / "one-frame.parquet", rows([0]))
     write(folder / "large-string.parquet", good(), types={**TYPES, "sequence": pa.large_string()})
@@ -178,6 +200,10 @@ def write_invalid(folder: Path) -> None:
     bad_document("image-size-text", "image_size", sequences={"a": {"image_size": "640x480"}})
     bad_document("attributes-text", "attributes", sequences={"a": {"attributes": "Occlusion"}})
     bad_document("tracker-text", "tracker", tracker="example")
+    bad_document("text-escape", "tracker.name", "control character", tracker={"name": "\x1b[2J"})
+    bad_document("text-newline", "note", "control character", note=["one", "two\nthree"])
+    bad_document("text-in-key", "control character", settings={"\0": 1})
+    bad_document("text-half-character", "tracker.name", "Unicode", tracker={"name": "\ud800"})
     for name, word, search in (
         ("search-text", "search", "near"),
         ("search-without-side", "half_side", {"window": True}),
@@ -219,7 +245,26 @@ def write_invalid(folder: Path) -> None:
     bad("frame-0-not-processed", "'b'", "frame 0", columns=first_skipped)
     bad("box-nan", "'h'", "'b'", "frame 3", "nan", columns=changed("h", 7, float("nan")))
     bad("truth-infinite", "truth_x", "inf", columns=changed("truth_x", 1, float("inf")))
+    for name, value in (("score-nan", float("nan")), ("score-infinite", float("inf"))):
+        bad(name, "score", "'a'", "frame 2", "finite or null", columns=changed("score", 2, value))
+    named = mapped(lambda name: f"{name}\r", "sequence")
+    bad("sequence-control-character", "sequence", "control character", columns=named)
     bad("time-negative", "elapsed_ns", "negative", columns=changed("elapsed_ns", 3, -5))
+
+    for name, row, words, change in (
+        ("arrival-null", 5, ["'b'", "frame 1", "null"], None),
+        ("arrival-twice", 2, ["'a'", "frame 2", "not after"], 33_333_333),
+        ("arrivals-not-ascending", 7, ["'b'", "frame 3", "not after"], 1),
+        ("arrivals-not-from-zero", 4, ["'b'", "frame 0", "count from frame 0"], 1_000_000),
+    ):
+        bad(name, "arrival_ns", *words, columns=arriving((row, change)), document=NEWER)
+    in_seconds = {**good(), "arrival_ns": [0.0, 0.03, 0.07, 0.17] * 2}
+    bad("arrivals-in-seconds", "arrival_ns", "seconds", columns=in_seconds, document=NEWER,
+        types={**TYPES, "arrival_ns": pa.float64()})  # fmt: skip
+    in_ms = {**good(), "arrival_ns": [0, 33, 69, 167] * 2}
+    bad("arrivals-in-milliseconds", "arrival_ns", "milliseconds", columns=in_ms, document=NEWER)
+    bad("flags-as-numbers", "visible", "bool", columns=flagged(1, 1, 0, 1), document=NEWER,
+        types={**TYPES, "visible": pa.int8()})  # fmt: skip
 
     in_ms = mapped(lambda ns: ns // 1_000_000, "elapsed_ns")
     bad("times-in-milliseconds", "elapsed_ns", "milliseconds", columns=in_ms)

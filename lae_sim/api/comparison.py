@@ -215,6 +215,7 @@ def compare_forecasters(
     folds: int = 5,
     seed: int = 0,
     progress: bool | None = None,
+    forget_arrivals: bool = False,
 ) -> ComparisonResult:
     """Which forecaster helps, by how much, and how sure that is.
 
@@ -228,7 +229,7 @@ def compare_forecasters(
             ``"hold"`` and the tracker's own ``offline`` score are always compared.
         sigma: permitted latencies in frames, or ``"grid"``, whose scores are compared as means.
         latency, scale: one or several, one after another, as in :func:`evaluate`.
-        fps, policy, convention, costs, sequences: as in :func:`evaluate`.
+        fps, policy, convention, costs, sequences, forget_arrivals: as in :func:`evaluate`.
         passes, search, pre_forecaster, keep_size: as in :func:`evaluate`; of several traces, each
             pass goes with those of its tracker and dataset. Forecasters are compared by the
             modelled scores where the reach is known (see
@@ -272,6 +273,7 @@ def compare_forecasters(
         search=search,
         pre_forecaster=pre_forecaster,
         keep_size=keep_size,
+        forget_arrivals=forget_arrivals,
         convention=convention,
         costs=cost_texts(costs),
         **open_others(None, passes),

@@ -27,7 +27,7 @@ from lae_sim.api.inputs import (
 from lae_sim.boxes import iou
 from lae_sim.engine.clock import Number, exact
 from lae_sim.engine.scheduler import Policy
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, hint, listed, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
 from lae_sim.evaluation.metrics import METRICS, find_convention
@@ -119,7 +119,7 @@ class Scenario:
             if sequences:
                 rows.add(part)
         notes = notes_on(totals.replay, metadata, convention, self.forecasters)
-        notes += [*stalls.notes(), *cost_notes(self.costs)]
+        notes += [*self.runs.notes(), *stalls.notes(), *cost_notes(self.costs)]
         return Evaluated(self, totals, rows, tuple(notes))
 
 
@@ -161,6 +161,7 @@ class Evaluated:
             "times_from": path if runs.timing is None else path_of(runs.timing) or "an open trace",
             "times_note": runs.times.metadata.timing_note,
             "fps": str(runs.clock.fps),
+            "arrivals": runs.arrivals,
             "policy": label_of(world.policy),
             "latency": label_of(world.latency),
             "latency_scale": str(world.scale),
@@ -358,7 +359,7 @@ class EvaluationResult:
         Returns:
             A row per world frame: ``frame``; the answer ``x, y, w, h`` in pixels; ``source_frame``,
             the frame of the output that it comes from; the truth ``truth_x`` to ``truth_h``; the
-            ``iou`` of the two.
+            ``iou`` of the two; ``visible``, where the trace says whether the target is.
 
         Raises:
             LaeError: if there is no such trace, sequence, forecaster or permitted latency.
@@ -385,7 +386,7 @@ class EvaluationResult:
             chosen,
             scenario.costs.get(forecaster, 0),
         )
-        truth = run.recording.truth
+        truth, visible = run.recording.truth, run.recording.visible
         return pd.DataFrame(
             {
                 "frame": np.arange(len(run)),
@@ -393,6 +394,7 @@ class EvaluationResult:
                 "source_frame": found.source_frame,
                 **dict(zip(("truth_x", "truth_y", "truth_w", "truth_h"), truth.T)),
                 "iou": iou(found.boxes, truth),
+                **({} if visible is None else {"visible": visible}),
             }
         )
 
@@ -412,7 +414,7 @@ class EvaluationResult:
         if trace is None and len(named) == 1:
             return next(iter(named.values()))
         if trace not in named:
-            raise LaeError(f"trace: name one of {', '.join(reversed(named))}")
+            raise LaeError(f"trace: name one of {listed(reversed(named))}")
         return named[trace]
 
     def __repr__(self) -> str:
@@ -556,6 +558,7 @@ def evaluate(
     dataset: str | None = None,
     camera_lag: int | None = None,
     progress: bool | None = None,
+    forget_arrivals: bool = False,
 ) -> EvaluationResult:
     """Replay traces and score them, latency counted.
 
@@ -587,6 +590,8 @@ def evaluate(
         root, dataset, camera_lag: the frames, for ``camera+NAME`` (see
             :func:`lae_sim.learning.registry.find_camera`).
         progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        forget_arrivals: let frames arrive evenly also where a trace says when each of them did,
+            which is needed for another rate.
 
     Raises:
         LaeError: if an argument is impossible, a file is missing, or a frame is asked for that a
@@ -612,6 +617,7 @@ def evaluate(
         search=search,
         pre_forecaster=pre_forecaster,
         keep_size=keep_size,
+        forget_arrivals=forget_arrivals,
         sigma=sigma,
         convention=convention,
         forecasters=makers,

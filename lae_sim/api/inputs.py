@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from lae_sim.engine.clock import whole
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, shown, visible
 from lae_sim.files import sequence_names
 from lae_sim.forecast.base import Hold
 from lae_sim.forecast.costs import parse_cost
@@ -59,7 +59,7 @@ def labelled_traces(traces: Traces, sequences: Iterable[str] | None = None) -> d
     names = [label for label, _ in opened]
     if not isinstance(traces, Mapping):
         short = [Path(label).name if path_of(trace) else label for label, trace in opened]
-        names = short if len(set(short)) == len(short) else names
+        names = [*map(visible, short if len(set(short)) == len(short) else names)]
     found = dict(zip(names, (trace for _, trace in opened)))
     if len(found) < len(opened):
         raise LaeError("traces: several have the same name: give a mapping from names to traces")

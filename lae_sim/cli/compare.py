@@ -17,11 +17,13 @@ from lae_sim.cli.options import (
     check_outputs,
     exit_status,
     new_parser,
+    print_json,
 )
 from lae_sim.engine.clock import parse_rational, whole
 from lae_sim.errors import LaeError
 from lae_sim.files import check_folders
 from lae_sim.learning.registry import FORECASTERS
+from lae_sim.progress import print_text
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -96,7 +98,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    import json
 
     from lae_sim import __version__
     from lae_sim.api.comparison import compare_forecasters
@@ -117,6 +118,7 @@ def _compare(arguments: argparse.Namespace) -> None:
         search=arguments.search,
         pre_forecaster=arguments.pre_forecaster,
         keep_size=arguments.keep_size,
+        forget_arrivals=arguments.forget_arrivals,
         convention=arguments.convention,
         costs=arguments.cost,
         sequences=arguments.sequence,
@@ -154,12 +156,12 @@ def _compare(arguments: argparse.Namespace) -> None:
             **{name: _records(table) for name, table in tables.items()},
         }
         document["summary"] = [_with_modelled(row) for row in document["summary"]]
-        print(json.dumps(document, indent=2, allow_nan=False))
+        print_json(document)
         return
     for table in reversed(tables.values()):
-        print(comparison_table(table), end="\n\n")
+        print_text(comparison_table(table), end="\n\n")
     about = f"convention {arguments.convention}, policy {arguments.policy}"
-    print("\n".join([about, *result.notes]))
+    print_text("\n".join([about, *result.notes]))
 
 
 def _check_files(arguments: argparse.Namespace, traces: Sequence[str]) -> None:
@@ -177,13 +179,16 @@ def _check_files(arguments: argparse.Namespace, traces: Sequence[str]) -> None:
 
 def _write(table: DataFrame, path: str) -> None:
     """Write the table, whole or not at all."""
-    from lae_sim.files import written_whole
+    from lae_sim.files import csv_cell, written_whole
 
     with written_whole(path) as temporary:
         if path.endswith(".csv"):
-            table.to_csv(temporary, index=False)
+            texts = [name for name in table if table[name].dtype.kind == "O"]
+            quoted = {name: [*map(csv_cell, table[name])] for name in texts}
+            table.assign(**quoted).to_csv(temporary, index=False, encoding="utf-8")
         else:
-            table.to_parquet(temporary, index=False)
+            with open(temporary, "wb") as file:  # whose name need not be UTF-8
+                table.to_parquet(file, index=False)
 
 
 def _records(table: DataFrame) -> list[dict[str, Any]]:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import argument, exit_status, new_parser
-from lae_sim.errors import LaeError
+from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser, print_json
+from lae_sim.errors import LaeError, listed
 from lae_sim.files import check_distinct
-from lae_sim.progress import ProgressBar
+from lae_sim.progress import ProgressBar, print_text
 
 if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary
@@ -45,7 +44,12 @@ examples:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim convert``; see ``--help``."""
     arguments = _parser().parse_args(argv)
-    return exit_status(lambda: _convert(arguments), "lae-sim convert", arguments.max_decoded)
+    return exit_status(
+        lambda: _convert(arguments),
+        "lae-sim convert",
+        arguments.max_decoded,
+        prints_result=False,
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -96,6 +100,7 @@ def _parser() -> argparse.ArgumentParser:
         help="other ground truth for one sequence",
     )
     add("--skip-missing", action="store_true", help="leave out results without ground truth")
+    add_frame_times(add)
     add("--image-size", type=argument(_size), metavar="WxH", help="image size, such as 1280x720")
     add(
         "--force",
@@ -131,6 +136,7 @@ def _convert(arguments: argparse.Namespace) -> None:
             truth_files=truth_files,
             skip_missing=arguments.skip_missing,
             image_size=arguments.image_size,
+            frame_times=arguments.frame_times,
             progress=bar,
         )
     check_distinct([arguments.out], summary.files)
@@ -138,15 +144,13 @@ def _convert(arguments: argparse.Namespace) -> None:
         check_replaces(arguments.out, summary.tracker, summary.dataset)
     write_trace(trace, arguments.out)
     if arguments.json:
-        print(json.dumps(summary.document(arguments.out), indent=2))
+        print_json(summary.document(arguments.out))
     else:
-        print(_text(summary, arguments.out))
+        print_text(_text(summary, arguments.out))
 
 
 def _text(summary: ConversionSummary, out: Path) -> str:
     """The summary for people."""
-    from lae_sim.importers.convert import listed
-
     processed = "every frame"
     if summary.schedule == "real-time":
         processed = f"in real time, {summary.processed:,} processed"
@@ -174,11 +178,11 @@ def _text(summary: ConversionSummary, out: Path) -> str:
         )
     if summary.other_trackers:
         lines.append(f"Left out, of other trackers: {listed(summary.other_trackers)}.")
+    lines += [f"Note: {each}." for each in summary.notes]
     if summary.without_truth:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:
         lines.append(f"Without results: {listed(summary.without_results)}.")
-    lines += [f"Note: {note}." for note in summary.notes]
     return "\n".join([*lines, f"Next: lae-sim replay {out}"])
 
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from lae_sim.cli.options import add_search, check_outputs, exit_status, new_parser
+from lae_sim.cli.options import add_search, check_outputs, exit_status, new_parser, print_json
+from lae_sim.progress import print_text
 
 PROGRAM = "lae-sim fidelity"
 
@@ -55,7 +56,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fidelity(arguments: argparse.Namespace) -> None:
-    import json
 
     from lae_sim import __version__
     from lae_sim.comparison.fidelity import (
@@ -99,22 +99,22 @@ def _fidelity(arguments: argparse.Namespace) -> None:
         }
         parts = {name: [_plain(each) for each in of] for name, of in records.items()}
         document = {**head, **settings, "traces": arguments.traces, **parts, "verdicts": verdicts}
-        print(json.dumps(document, indent=2, allow_nan=False))
+        print_json(document)
         return
     if arguments.per_sequence:
-        print(fidelity_table(rows), end="\n\n")
-    print(fidelity_table(summary), end="\n\n")
+        print_text(fidelity_table(rows), end="\n\n")
+    print_text(fidelity_table(summary), end="\n\n")
     if len({each.closed_loop for each in summary}) > 1:
-        print(fidelity_table(overall), end="\n\n")
+        print_text(fidelity_table(overall), end="\n\n")
     if spreads:
-        print(spread_table(spreads), end="\n\n")
-    print(
+        print_text(spread_table(spreads), end="\n\n")
+    print_text(
         f"AUC by convention {arguments.convention}; |d| is |replay - closed loop| of a sequence.\n"
         "every-frame: boxes of TRACE; strided: of the pass nearest to the frames skipped;\n"
         "modelled: what a tracker would have answered that finds its target only near its last "
         "answer."
     )
-    print(*verdicts, sep="\n")
+    print_text("\n".join(verdicts))
 
 
 def _plain(record: Any) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from lae_sim import __version__
+from lae_sim.cli.options import new_parser
 
 COMMANDS = {
     "compare": "compare forecasters, with intervals and paired tests",
@@ -25,13 +26,12 @@ COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim COMMAND ...``."""
     listing = "\n".join(f"  {name:9}{text}" for name, text in COMMANDS.items())
-    parser = argparse.ArgumentParser(
-        prog="lae-sim",
-        usage="lae-sim COMMAND ...",
-        description="Latency-aware evaluation of visual trackers.",
-        epilog=f"commands:\n{listing}\n\nlae-sim COMMAND --help says more.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = new_parser(
+        "lae-sim",
+        "Latency-aware evaluation of visual trackers.",
+        f"commands:\n{listing}\n\nlae-sim COMMAND --help says more.",
     )
+    parser.usage = "lae-sim COMMAND ..."
     parser.add_argument("--version", action="version", version=f"lae-sim {__version__}")
     parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help=argparse.SUPPRESS)
     arguments = list(sys.argv[1:] if argv is None else argv)

@@ -6,15 +6,16 @@ import argparse
 import os
 import select
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from itertools import product
-from typing import TYPE_CHECKING, Any, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
 from lae_sim.engine.clock import parse_fps, parse_rational, whole
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, abridged, visible
 from lae_sim.files import MAX_DECODED, max_decoded, parse_size
-from lae_sim.progress import tell
+from lae_sim.progress import OutputError, print_text, printing, tell
 
 if TYPE_CHECKING:
     from lae_sim.replay.world import World
@@ -46,6 +47,16 @@ def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
     add("--timing", metavar="TRACE", help="take the times from another device's trace")
 
     add_passes(add)
+
+
+def add_frame_times(add: Callable[..., argparse.Action]) -> None:
+    """Add when frames come among whose images numbers are missing, by what adds to a group."""
+    add(
+        "--frame-times",
+        choices=("numbers", "even"),
+        help="where image numbers are missing, as if a camera had dropped frames: let each image "
+        "come at the time of its number, or one after another (default: such images are refused)",
+    )
 
 
 def add_passes(add: Callable[..., argparse.Action]) -> None:
@@ -131,6 +142,11 @@ def _world_group(
         **({"nargs": "+", "default": []} if sweeps else {}),
         help="world frame rate, exact (default: the trace's)" + (several if sweeps else ""),
     )
+    add(
+        "--forget-arrivals",
+        action="store_true",
+        help="let frames arrive evenly also where the trace says when each of them did",
+    )
     add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
     return add
 
@@ -184,9 +200,17 @@ def argument(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     return parsed
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are as short as those of the work."""
+
+    def error(self, message: str) -> NoReturn:
+        tell(f"{self.prog}: error: {abridged(visible(message))} ({self.prog} --help says more)")
+        self.exit(2)
+
+
 def new_parser(program: str, description: str, examples: str) -> argparse.ArgumentParser:
     """A command line's parser, with the option that all have; its help ends with examples."""
-    made = argparse.ArgumentParser(
+    made = _Parser(
         prog=program,
         description=description,
         epilog=examples,
@@ -202,7 +226,12 @@ def new_parser(program: str, description: str, examples: str) -> argparse.Argume
     return made
 
 
-def exit_status(work: Callable[[], None], program: str, decoded: int | str = MAX_DECODED) -> int:
+def exit_status(
+    work: Callable[[], None],
+    program: str,
+    decoded: int | str = MAX_DECODED,
+    prints_result: bool = True,
+) -> int:
     """Do the work of a command; its exit status is 0, 2 for an error, 130 for Ctrl-C.
 
     It is 1 where memory ran out. An error is one or two lines on the standard error stream, without
@@ -210,16 +239,19 @@ def exit_status(work: Callable[[], None], program: str, decoded: int | str = MAX
     error.
 
     Args:
-        work: what the command does.
-        program: its name.
+        work: reads, computes, writes and prints.
+        program: what its messages begin with.
         decoded: what a file may take in memory (see :func:`lae_sim.files.max_decoded`).
+        prints_result: whether what it prints is the result, and lost if it cannot be printed; and
+            not only words about files.
     """
     _occupy_closed_streams()
     try:
         with max_decoded(decoded):
             work()
         if sys.stdout is not None:
-            sys.stdout.flush()
+            with printing():
+                sys.stdout.flush()
     except KeyboardInterrupt:
         tell(f"{program}: interrupted")
         return 130
@@ -228,11 +260,30 @@ def exit_status(work: Callable[[], None], program: str, decoded: int | str = MAX
         return 1
     except (LaeError, OSError) as error:
         if isinstance(error, BrokenPipeError) and _reader_gone(sys.stdout):  # such as head
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _forget_output()
             return 0
-        tell(f"{program}: error: {error}")
+        if isinstance(error, OutputError):
+            _forget_output()
+            lost = "the result is lost" if prints_result else "the files are written"
+            tell(f"{program}: {'error: ' * prints_result}{error}: {lost}")
+            return 2 * prints_result
+        tell(f"{program}: error: {abridged(visible(error))}")
         return 2
     return 0
+
+
+def _forget_output() -> None:
+    """Let what is still to be printed go nowhere, or Python would try it again at its end."""
+    with suppress(OSError):  # a standard output that is no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """Print a document as strict JSON, in letters that every terminal has."""
+    import json
+
+    text = json.dumps(document, indent=2, allow_nan=False)
+    print_text(text.replace("\x7f", "\\u007f"))  # which JSON, but no terminal, takes for a letter
 
 
 def _occupy_closed_streams() -> None:
@@ -315,5 +366,6 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
         search=getattr(arguments, "search", "off"),
         pre_forecaster=getattr(arguments, "pre_forecaster", None),
         keep_size=getattr(arguments, "keep_size", False),
+        forget_arrivals=arguments.forget_arrivals,
         **scores,
     )

@@ -8,13 +8,20 @@ from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from lae_sim.cli.options import argument, exit_status, new_parser, parse_box
+from lae_sim.cli.options import (
+    add_frame_times,
+    argument,
+    exit_status,
+    new_parser,
+    parse_box,
+    print_json,
+)
 from lae_sim.engine.clock import parse_budget, parse_duration, parse_fps, parse_stride, whole
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.plugins import key_and_value
-from lae_sim.progress import ProgressBar, tell
+from lae_sim.progress import ProgressBar, print_text, tell
 
 if TYPE_CHECKING:
     from lae_sim.profile.passes import PassSummary
@@ -99,6 +106,7 @@ def parser() -> argparse.ArgumentParser:
     add("--sequence", nargs="+", action="extend", metavar="NAME", help="these sequences only")
     add("--box", type=argument(parse_box), metavar="X,Y,W,H", help="first box, for a video")
     add("--fps", type=argument(parse_fps), help="world frame rate, exact (default: the dataset's)")
+    add_frame_times(add)
     group = made.add_argument_group("the run")
     add = group.add_argument
     add(
@@ -174,15 +182,15 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 1 if sequences failed, 2 for bad input."""
     arguments = parser().parse_args(argv)
-    failed: list[int] = []
-    status = exit_status(lambda: failed.append(_profile(arguments)), PROGRAM, arguments.max_decoded)
-    return status or int(any(failed))
+    failed: list[Any] = []
+    status = exit_status(
+        lambda: _profile(arguments, failed), PROGRAM, arguments.max_decoded, prints_result=False
+    )
+    return status or int(bool(failed))
 
 
-def _profile(arguments: argparse.Namespace) -> int:
-    """Profile, write the traces and say what was done; how many sequences failed."""
-    import json
-
+def _profile(arguments: argparse.Namespace, failed: list[Any]) -> None:
+    """Profile, write the traces and say what was done; add the sequences that failed."""
     from lae_sim.plugins import parse_options
     from lae_sim.profile.gaps import BUDGET_NS
     from lae_sim.profile.run import ProfilePlan, run_profile
@@ -206,6 +214,7 @@ def _profile(arguments: argparse.Namespace) -> int:
         sequences=arguments.sequence,
         box=arguments.box,
         fps=arguments.fps,
+        frame_times=arguments.frame_times,
         mode=arguments.mode,
         policy=arguments.policy,
         pre_forecaster=arguments.pre_forecaster,
@@ -233,12 +242,12 @@ def _profile(arguments: argparse.Namespace) -> int:
             notice=notice,
         )
     if not profile.traces:  # it was complete already
-        return 0
+        return
+    failed += profile.failures
     if arguments.json:
-        print(json.dumps(asdict(profile), indent=2))
+        print_json(asdict(profile))
     else:
         _print_summary(profile.traces)
-    return len(profile.failures)
 
 
 def _print_summary(traces: Sequence[PassSummary]) -> None:
@@ -246,7 +255,7 @@ def _print_summary(traces: Sequence[PassSummary]) -> None:
 
     from lae_sim.report.trace import profile_table
 
-    print(profile_table(traces))
+    print_text(profile_table(traces))
     first, *others = traces
     kind = first.schedule["kind"]
     strided = [each for each in others if "stride" in each.schedule]
@@ -258,11 +267,11 @@ def _print_summary(traces: Sequence[PassSummary]) -> None:
         return f" {option} {paths}" if passes else ""
 
     path, strides = shlex.quote(first.trace), named("--strided", strided + gaps)
-    print("\nnext:")
+    print_text("\nnext:")
     if first not in gaps:  # which are all that is left where every sequence of the others failed
-        print(f"  lae-sim replay {path}{strides}")
+        print_text(f"  lae-sim replay {path}{strides}")
         if closed:
-            print(f"  lae-sim fidelity {path}{strides}{named('--closed-loop', closed)}")
-        print(f"  lae-sim show {path}")
+            print_text(f"  lae-sim fidelity {path}{strides}{named('--closed-loop', closed)}")
+        print_text(f"  lae-sim show {path}")
     for each in gaps:
-        print(f"  lae-sim show {shlex.quote(each.trace)} --plot reach.png")
+        print_text(f"  lae-sim show {shlex.quote(each.trace)} --plot reach.png")

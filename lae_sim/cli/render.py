@@ -69,7 +69,9 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 2 for bad input."""
     arguments = parser().parse_args(argv)
-    return exit_status(lambda: _render(arguments), PROGRAM, arguments.max_decoded)
+    return exit_status(
+        lambda: _render(arguments), PROGRAM, arguments.max_decoded, prints_result=False
+    )
 
 
 def _render(arguments: argparse.Namespace) -> None:
@@ -122,7 +124,8 @@ def _images(run: Run, metadata: Metadata, arguments: argparse.Namespace) -> Imag
     root = None if arguments.root is None else Path(arguments.root).expanduser()
     box = run.recording.truth[0] if root is not None and root.is_file() else None
     sequences = None if box is not None else [run.recording.name]
-    return find_dataset(name, root, sequences, box).sequences[0]
+    # the trace knows when its frames came
+    return find_dataset(name, root, sequences, box, frame_times="even").sequences[0]
 
 
 def _sheet(scene: Scene, frames: Sequence[int], path: Path) -> None:

@@ -17,12 +17,14 @@ from lae_sim.cli.options import (
     check_outputs,
     exit_status,
     new_parser,
+    print_json,
     worlds_of,
 )
 from lae_sim.engine.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import labels
 from lae_sim.learning.registry import FORECASTERS
+from lae_sim.progress import print_text
 
 if TYPE_CHECKING:
     from lae_sim.api.evaluation import Scenario
@@ -52,7 +54,7 @@ policies:     latest, fifo, every:N, shrinking-tail:TIME (expected processing ti
 latencies:    recorded, by-call, constant:TIME, resample:SEED, lognormal:SEED,
               bootstrap:SEED[:BLOCK], or your own, package.module:object; each may end in
               ,init=TIME, what the initialisation takes: constant:47ms,init=800ms
-conventions:  pysot, elae, otb, got10k, got10k-101, exclude
+conventions:  pysot, elae, otb, lasot, got10k, got10k-101, exclude
 """
 
 
@@ -123,7 +125,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _replay(arguments: argparse.Namespace) -> None:
-    import json
 
     from lae_sim.api.evaluation import EvaluationResult, plot_evaluations, scenario_bar, scenarios
     from lae_sim.engine.scheduler import scores_latency
@@ -184,7 +185,7 @@ def _replay(arguments: argparse.Namespace) -> None:
     result = EvaluationResult(scored)
     document = result.document(arguments.attributes, arguments.per_sequence)
     if arguments.json:
-        print(json.dumps(document, indent=2, allow_nan=False))
+        print_json(document)
     else:
         trace_labels = [scenario.label for scenario in asked]
         _print_tables(document["traces"], trace_labels, swept, arguments)
@@ -250,14 +251,14 @@ def _print_tables(
     shown = sorted({float(sigma) for sigma in arguments.sigma})
     for each in reports:
         if arguments.per_sequence:
-            print(f"{each['trace']}\n\n{sequence_table(each, shown, swept)}\n")
+            print_text(f"{each['trace']}\n\n{sequence_table(each, shown, swept)}\n")
         if arguments.attributes:
-            print(f"{each['trace']}\n\n{attribute_table(each, shown, swept)}\n")
-    print(summary_table(reports, trace_labels, shown, swept), end="\n\n")
+            print_text(f"{each['trace']}\n\n{attribute_table(each, shown, swept)}\n")
+    print_text(summary_table(reports, trace_labels, shown, swept), end="\n\n")
     for each in reports:
-        print(settings_text(each))
+        print_text(settings_text(each))
     if "fps" in swept:
-        print(
+        print_text(
             "a sweep of the rate is one of how fast the world moves: recorded frames arrive "
             "faster, with the same motion from one to the next"
         )

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from collections.abc import Sequence
 
-from lae_sim.cli.options import check_outputs, exit_status, new_parser
+from lae_sim.cli.options import check_outputs, exit_status, new_parser, print_json
+from lae_sim.progress import print_text
 
 _EXAMPLES = """\
 examples:
@@ -48,8 +47,6 @@ def _show(arguments: argparse.Namespace) -> None:
     from lae_sim.trace.locate import find_traces
 
     paths = find_traces(arguments.traces)
-    if hasattr(sys.stdout, "reconfigure"):
-        sys.stdout.reconfigure(errors="replace")  # a name may have what the terminal has not
     if arguments.plot:
         from lae_sim.report.style import check_format
 
@@ -74,10 +71,10 @@ def _show(arguments: argparse.Namespace) -> None:
             report if reach is None else {**report, "reach": reach.document()}
             for report, reach in zip(reports, reaches)
         ]
-        print(json.dumps({**document, "traces": shown}, indent=2, allow_nan=False))
+        print_json({**document, "traces": shown})
     else:
         texts = [
             overview(report) + ("" if reach is None else "\n\n" + reach.text())
             for report, reach in zip(reports, reaches)
         ]
-        print("\n\n".join(texts))
+        print_text("\n\n".join(texts))

@@ -5,11 +5,15 @@ from __future__ import annotations
 import argparse
 import signal
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import argument, exit_status, new_parser
+from lae_sim.cli.options import argument, exit_status, new_parser, print_json
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError
-from lae_sim.progress import tell
+from lae_sim.progress import print_text, tell
+
+if TYPE_CHECKING:
+    from lae_sim.study.records import Failure
 
 PROGRAM = "lae-sim study"
 
@@ -27,6 +31,8 @@ conventions are crossed:
   forecasters = ["hold", "kalman"]       as in compare
   policies = ["latest"]                  as in replay
   fps = ["trace", 60]                    world frame rates; "trace" is each trace's own
+  forget_arrivals = false                whether frames arrive evenly also where a trace says when
+                                         each of them did
   latencies = ["recorded", "bootstrap"]  also by-call, constant:47ms; bootstrap (in blocks),
                                          resample and lognormal are drawn anew in each repetition
   passes = ["nano.gaps.parquet"]         strided and gap passes, for traces of their tracker and
@@ -69,17 +75,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 1 if a part could not be computed, 2 for bad input."""
     arguments = parser().parse_args(argv)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no worker stays behind
-    failed: list[bool] = []
-    status = exit_status(lambda: failed.append(_study(arguments)), PROGRAM, arguments.max_decoded)
+    failed: list[Failure] = []
+    status = exit_status(
+        lambda: _study(arguments, failed), PROGRAM, arguments.max_decoded, prints_result=False
+    )
     if status == 130:
         tell("what is finished is kept: the same command goes on from there")
-    return status or int(any(failed))
+    return status or int(bool(failed))
 
 
-def _study(arguments: argparse.Namespace) -> bool:
-    """Run the study; whether a part of it failed."""
-    import json
-
+def _study(arguments: argparse.Namespace, failed: list[Failure]) -> None:
+    """Run the study, and add the parts of it that failed."""
     from lae_sim.api.study import run_study
 
     if arguments.workers is not None and arguments.scheduler is not None:
@@ -91,12 +97,12 @@ def _study(arguments: argparse.Namespace) -> bool:
         scheduler=arguments.scheduler,
         report=not arguments.no_report,
     )
+    failed += results.failures
     if arguments.json:
-        print(json.dumps(results.document(), indent=2, allow_nan=False))
+        print_json(results.document())
     else:
         from lae_sim.report.study_tables import study_text
 
-        print(study_text(results), end="\n\n")
+        print_text(study_text(results), end="\n\n")
         left = sorted(path.name for path in results.folder.glob("[!.]*"))
-        print(f"{results.folder}: {', '.join(left)}")
-    return bool(results.failures)
+        print_text(f"{results.folder}: {', '.join(left)}")

@@ -7,9 +7,17 @@ from collections.abc import Sequence
 from fractions import Fraction
 from functools import partial
 
-from lae_sim.cli.options import add_worlds, argument, check_outputs, exit_status, new_parser
+from lae_sim.cli.options import (
+    add_worlds,
+    argument,
+    check_outputs,
+    exit_status,
+    new_parser,
+    print_json,
+)
 from lae_sim.engine.clock import whole
 from lae_sim.files import check_folders
+from lae_sim.progress import print_text
 
 PROGRAM = "lae-sim train"
 
@@ -52,11 +60,12 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 2 for bad input."""
     arguments = parser().parse_args(argv)
-    return exit_status(lambda: _train(arguments), PROGRAM, arguments.max_decoded)
+    return exit_status(
+        lambda: _train(arguments), PROGRAM, arguments.max_decoded, prints_result=False
+    )
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    import json
 
     from tqdm import tqdm
 
@@ -87,9 +96,9 @@ def _train(arguments: argparse.Namespace) -> None:
     learned = Learned(rule.network, {**rule.document, **made})
     write_learned(learned, arguments.out)
     if arguments.json:
-        print(json.dumps({"forecaster": arguments.out, **learned.document}, indent=2))
+        print_json({"forecaster": arguments.out, **learned.document})
         return
-    print(
+    print_text(
         f"{arguments.out}: trained on {len(examples.item):,} queries of "
         f"{len(learned.trained_on)} sequences, {arguments.steps:,} steps, seed {arguments.seed}\n\n"
         f"next:\n  lae-sim replay OTHER.parquet --forecaster kalman learned:{arguments.out}"

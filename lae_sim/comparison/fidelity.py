@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lae_sim._arrays import Floats
 from lae_sim.boxes import PARTED_IOU, iou
 from lae_sim.engine.clock import Clock
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed
 from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.evaluation.modelled import MODELLED
@@ -326,7 +326,7 @@ def _replayed_for(path: str, closed: Trace, replayed: Sequence[_Replayed]) -> _R
             each for each in found if each.trace.metadata.pre_forecaster is None
         ]
     if len(found) != 1:
-        several = " and ".join(each.path for each in found)
+        several = listed(each.path for each in found)
         raise LaeError(
             f"{path}: {several} are of its tracker and have its sequences: give one of them"
             if several

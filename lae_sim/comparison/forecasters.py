@@ -102,6 +102,7 @@ def score_forecasters(
             tables.append(rows.assign(trace=label, dataset=dataset, **setting))
             said.add({"trace": label, **setting}, world, replay, evaluation, list(ready), costs)
             about += notes_on(evaluation.replay, trace.metadata, convention, ready)
+            about += replay.notes()
         said.notes += [f"{label}: {note}" for note in dict.fromkeys(about)]
     return _joined(tables, said)
 

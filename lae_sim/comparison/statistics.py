@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Floats
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed
 from lae_sim.evaluation.totals import recovered
 
 if TYPE_CHECKING:
@@ -282,7 +282,7 @@ def _wide(table: pd.DataFrame, metrics: Sequence[str]) -> tuple[pd.DataFrame, di
 
     missing = set(KEYS[1:] + ["dataset", "sequence", "value"]) - set(table)
     if missing:
-        raise LaeError(f"the table of a comparison lacks the columns {', '.join(sorted(missing))}")
+        raise LaeError(f"the table of a comparison lacks the columns {listed(sorted(missing))}")
     table = table[table["metric"].isin(list(metrics))]
     keys = [key for key in KEYS if key in table]
     order = {key: list(table[key].unique()) for key in keys}

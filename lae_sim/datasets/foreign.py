@@ -136,6 +136,8 @@ def foreign_columns(table: Floats) -> Foreign | None:
     if columns == 8 and whole[4:].all() and rows[:, 4:].max() < 16 <= rows[:, :4].max():
         what = "VisDrone's detections (x, y, w, h, score, category, truncation, occlusion)"
         return Foreign(what, _BOXES)
+    if columns == 8 and whole.all() and rows[:, 1::2].max() < 10 <= rows[:, 0::2].max():
+        return Foreign("x, y, w, h with decimal commas", "write decimal points")
     if 7 <= columns <= 10 and columns != 8 and whole[:2].all() and (np.diff(rows[:, 0]) >= 0).all():
         what = "MOT's format (frame, id, x, y, w, h, ...)"
         return Foreign(what, "keep x,y,w,h of one target, a line for each frame")

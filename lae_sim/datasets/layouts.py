@@ -11,6 +11,7 @@ import itertools
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -18,12 +19,14 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.datasets.absence import read_visible
 from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
+from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, image_number, missing, note
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.names import SequenceNames
 from lae_sim.datasets.synthetic import synthetic_dataset
 from lae_sim.engine.clock import Number, parse_fps
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, listed, shown
 from lae_sim.files import sequence_names
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -62,6 +65,7 @@ def find_dataset(
     sequences: str | Sequence[str] | None = None,
     box: Sequence[float] | None = None,
     fps: Number | None = None,
+    frame_times: str | None = None,
 ) -> Dataset:
     """Find a dataset's images and ground truth.
 
@@ -75,6 +79,9 @@ def find_dataset(
         box: the first box ``x, y, w, h`` in pixels, for images or a video without ground truth.
         fps: frames per second; by default the dataset's (30, or 10 for UAV123_10fps and GOT-10k)
             or the video's own. Of NfS it chooses the set, of 30 or 240.
+        frame_times: where numbers are missing among a sequence's images, as if the camera had
+            dropped frames: ``"numbers"`` lets each image come at the time of its number, ``"even"``
+            one after another. Without it such images are refused.
 
     Returns:
         The dataset. Where only the first box is known, the truth after it is NaN.
@@ -92,6 +99,7 @@ def find_dataset(
     """
     sequences = None if sequences is None else sequence_names(sequences)
     fps = None if fps is None else parse_fps(fps)
+    check_frame_times(frame_times)
     if box is not None and len(box) != 4:
         raise LaeError(f"box: x, y, w, h in pixels, not {shown(box)}")
     if not isinstance(root, (str, os.PathLike, type(None))):
@@ -106,7 +114,7 @@ def find_dataset(
         return Dataset("synthetic", fps or Fraction(30), [synthetic[name] for name in chosen])
     root = Path(root)
     if root.is_file() or box is not None:
-        return _without_truth(name, root, sequences, box, fps)
+        return _without_truth(name, root, sequences, box, fps, frame_times)
     name = _SPELLINGS.get((name or "").lower(), name)
     named = root / "anno" / name if name else root
     truth = find_truth(named if named.is_dir() else root, fps)
@@ -114,12 +122,35 @@ def find_dataset(
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
-    chosen_sequences = [
-        _sequence(root, sequence, truth.files[sequence], attributes.of.get(sequence, ()))
-        for sequence in _choose(sequences, truth.files, str(root))
-    ]
+    made, numbers = [], []
+    notes = [*attributes.notes]
+    for sequence in _choose(sequences, truth.files, str(root)):
+        file = truth.files[sequence]
+        found, of_images = _sequence(root, sequence, file, attributes.of.get(sequence, ()))
+        visible, problem = read_visible(file, len(found))
+        made.append(replace(found, visible=visible))
+        numbers.append(of_images)
+        notes += [f"sequence {sequence!r}: {problem}"] if problem else []
     fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
-    return Dataset(name, fps, chosen_sequences, attributes.notes)
+    return _timed(Dataset(name, fps, made, tuple(notes)), numbers, frame_times)
+
+
+def _timed(dataset: Dataset, numbers: Sequence[Sequence[int]], frame_times: str | None) -> Dataset:
+    """The dataset with the times of its frames, given the numbers of each sequence's images."""
+    sequences = dataset.sequences
+    gaps = [sequence.name for sequence, own in zip(sequences, numbers) if missing(own)]
+    if not gaps:
+        return dataset
+    if frame_times is None:
+        first = next(s for s, own in enumerate(numbers) if missing(own))
+        raise ask(sequences[first].name, numbers[first], dataset.fps)
+    if frame_times == "numbers":  # of all: a trace has the times of every frame, or of none
+        sequences = [
+            replace(sequence, arrival_ns=arrivals(own, dataset.fps))
+            for sequence, own in zip(sequences, numbers)
+        ]
+    notes = (*dataset.notes, note(gaps, frame_times))
+    return replace(dataset, sequences=sequences, notes=notes, frame_times=frame_times)
 
 
 def _without_truth(
@@ -128,6 +159,7 @@ def _without_truth(
     sequences: Sequence[str] | None,
     box: Sequence[float] | None,
     fps: Fraction | None,
+    frame_times: str | None,
 ) -> Dataset:
     """A video or a folder of images of which only the first box is known."""
     sequence = root.resolve().stem if root.is_file() else root.resolve().name
@@ -135,6 +167,7 @@ def _without_truth(
     if box is None:
         raise LaeError(f"{root}: a video needs the target's first box: --box x,y,w,h")
     read: Callable[[int], Image]
+    numbers: Sequence[int] = ()
     if root.is_file():
         read = video = Video(root)
         length, fps = len(video), fps or video.fps
@@ -147,11 +180,16 @@ def _without_truth(
         if not paths:
             raise LaeError(f"{root}: no images there; --box needs a folder of images, or a video")
         read, length = partial(_read, sequence, paths), len(paths)
+        numbers = _numbers(paths)
     truth = _only_first(np.array([box], np.float64), length)
-    return Dataset(name or sequence, fps or Fraction(30), [ImageSequence(sequence, truth, read)])
+    made = [ImageSequence(sequence, truth, read)]
+    return _timed(Dataset(name or sequence, fps or Fraction(30), made), [numbers], frame_times)
 
 
-def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) -> ImageSequence:
+def _sequence(
+    root: Path, name: str, file: Path, attributes: tuple[str, ...]
+) -> tuple[ImageSequence, Sequence[int]]:
+    """A sequence, and the numbers of its images."""
     paths, first = _find_images(root, name, file)
     truth = read_truth(file, len(paths))
     if len(truth) == 1:
@@ -164,7 +202,8 @@ def _sequence(root: Path, name: str, file: Path, attributes: tuple[str, ...]) ->
             f"sequence {name!r}: {len(paths)} images in {paths[0].parent}, but {len(truth)} "
             f"annotations in {file}"
         )
-    return ImageSequence(name, truth, partial(_read, name, paths), attributes)
+    made = ImageSequence(name, truth, partial(_read, name, paths), attributes)
+    return made, _numbers(paths)
 
 
 def _find_images(root: Path, name: str, file: Path) -> tuple[list[Path], int | None]:
@@ -186,6 +225,27 @@ def _find_images(root: Path, name: str, file: Path) -> tuple[list[Path], int | N
     )
 
 
+def image_numbers(root: Path, name: str, file: Path, length: int) -> list[int]:
+    """The numbers of a sequence's images, where they are beside its ground truth; else none.
+
+    Args:
+        root: the dataset's folder.
+        name: the sequence's.
+        file: its ground truth.
+        length: number of frames.
+    """
+    try:
+        paths, first = _find_images(root, name, file)
+    except LaeError:
+        return []
+    numbers = _numbers(paths)
+    if len(numbers) > length:
+        first = first or _OTB_FIRST.get((name, length))
+        start = numbers.index(first) if first in numbers else 0
+        numbers = numbers[start : start + length]
+    return numbers if len(numbers) == length else []
+
+
 def _clip_first(file: Path) -> int:
     """The number of the first image of one of UAV123's clips, from the lengths before it."""
     first = _CLIP_FIRST.get(file.stem)
@@ -200,7 +260,7 @@ def _clip_first(file: Path) -> int:
 
 def _part(paths: list[Path], first: int | None, length: int, where: str) -> list[Path]:
     """``length`` images from number ``first``, or from the start; none may be missing between."""
-    numbers = [int("".join(re.findall("[0-9]+", path.stem)[-1:]) or -1) for path in paths]
+    numbers = _numbers(paths)
     if first is not None:
         if first not in numbers:
             raise LaeError(f"{where}: no image number {first}, where the sequence starts")
@@ -211,6 +271,10 @@ def _part(paths: list[Path], first: int | None, length: int, where: str) -> list
         gap = numbers[int(np.argmax(steps != 1))]
         raise LaeError(f"{where}: the image after number {gap} is missing, or there twice")
     return paths[:length]
+
+
+def _numbers(paths: Sequence[Path]) -> list[int]:
+    return [image_number(path.stem) for path in paths]
 
 
 def _list_images(folder: Path) -> list[Path]:
@@ -248,7 +312,7 @@ def _choose(wanted: Sequence[str] | None, available: Iterable[str], where: str) 
         if len(meant) != 1:
             close = difflib.get_close_matches(name, names) or names[:3]
             raise LaeError(
-                f"{where}: no sequence {name!r} among {len(names)}; there is {', '.join(close)}"
+                f"{where}: no sequence {shown(name)} among {len(names)}; there is {listed(close)}"
             )
         chosen.update(meant)
     return [name for name in names if not wanted or name in chosen]

@@ -16,7 +16,7 @@ import numpy as np
 from lae_sim._arrays import Floats
 from lae_sim.datasets.foreign import HEAD_BYTES, foreign
 from lae_sim.errors import LaeError
-from lae_sim.files import Budget
+from lae_sim.files import Budget, check_regular
 
 # A cell as a str, and its place in a list.
 _CELL_BYTES = 64
@@ -82,6 +82,11 @@ def read_cells(
         else:
             width = len(row)
         rows.append(row)
+    if _are_decimal_commas(rows):
+        raise LaeError(
+            f"{path}, line 1: {','.join(rows[0])!r:.40} looks like a number with a decimal "
+            "comma; write decimal points"
+        )
     width = width or max(map(len, rows))
     for index in no_target:
         rows[index] = ["nan"] * width
@@ -114,6 +119,13 @@ def read_numbers(
     return table
 
 
+def _are_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether two columns look like one of numbers such as 0,047 rather than two of whole ones."""
+    if not all(len(row) == 2 and row[0].isdigit() and row[1].isdigit() for row in rows):
+        return False
+    return all(row[0] == "0" for row in rows) or any(re.match("0[0-9]", row[1]) for row in rows)
+
+
 def _is_header(rows: Sequence[Sequence[str]]) -> bool:
     """Whether the first row names columns of numbers."""
     named = all(re.match(r"[^\W\d]", cell.strip("#\"' ")) for cell in rows[0] if cell != "#")
@@ -135,6 +147,7 @@ def read_text(path: Path, budget: Budget) -> str:
     Raises:
         LaeError: if it cannot be read, is no such text, or takes too much.
     """
+    check_regular(path)
     try:
         budget.take(path.stat().st_size)
         data = path.read_bytes()

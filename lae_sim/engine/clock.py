@@ -1,7 +1,9 @@
 """Exact time: rational frame rates, integer nanoseconds, integer ticks.
 
 No float decides an event. With a world rate of p/q frames per second, one tick is 1/p ns: frame
-``i`` arrives at exactly ``i * q * 10**9`` ticks, and ``n`` ns are ``n * p`` ticks.
+``i`` arrives at exactly ``i * q * 10**9`` ticks, and ``n`` ns are ``n * p`` ticks. Where a trace
+says when each frame really arrived, frame ``i`` arrives at ``arrival_ns[i] * p`` ticks instead, and
+``q * 10**9`` ticks are the *nominal* frame interval: :class:`Clock` answers for both.
 """
 
 from __future__ import annotations
@@ -11,9 +13,14 @@ from dataclasses import dataclass
 from fractions import Fraction
 from numbers import Integral
 from operator import index
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 from lae_sim.errors import LaeError, shown
+
+if TYPE_CHECKING:  # command lines read numbers before they need NumPy
+    from collections.abc import Sequence
+
+    from lae_sim._arrays import Count, Ints
 
 NS_PER_SECOND = 10**9
 MAX_INT64 = 2**63 - 1
@@ -189,10 +196,26 @@ def whole(value: int | str, least: int = 0) -> int:
 class Clock:
     """The tick clock of one world frame rate.
 
+    Policies ask it when a frame arrives (:meth:`arrival`), which is the newest one (:meth:`newest`)
+    and when the stream ends (:meth:`end`), rather than count intervals, and so are right also
+    where frames arrive at times of their own (:meth:`with_arrivals`).
+
     Attributes:
         ticks_per_ns: p, the numerator of the frame rate p/q.
-        frame_ticks: ticks between two frames, ``q * 10**9``.
+        frame_ticks: ticks of the nominal frame interval, ``q * 10**9``.
+        is_even: whether frames arrive at equal intervals.
+
+    Example:
+        >>> from lae_sim.engine import Clock
+        >>> clock = Clock.at(30)
+        >>> clock.arrival(2) / clock.ticks_per_ns == 2e9 / 30, clock.newest(clock.arrival(2))
+        (True, 2)
+        >>> dropped = clock.with_arrivals([0, 33_333_333, 100_000_000])  # one frame never came
+        >>> dropped.newest(clock.arrival(2)), dropped.end(3) == clock.end(4)
+        (1, True)
     """
+
+    is_even: ClassVar[bool] = True
 
     ticks_per_ns: int
     frame_ticks: int
@@ -206,13 +229,71 @@ class Clock:
         """
         if not isinstance(fps, (Fraction, int)):
             raise LaeError(f"a frame rate must be exact: parse_fps('30000/1001'), not {fps!r}")
-        return cls(fps.numerator, fps.denominator * NS_PER_SECOND)
+        return Clock(fps.numerator, fps.denominator * NS_PER_SECOND)
+
+    def with_arrivals(self, arrival_ns: Ints | Sequence[int] | None) -> Clock:
+        """The clock of one sequence whose frames arrive at times of their own.
+
+        Args:
+            arrival_ns: when each frame arrives, ns after the first one, int64 [T]; None where they
+                arrive evenly.
+
+        Raises:
+            LaeError: if they do not ascend from 0, or an instant does not fit in 64-bit ticks.
+        """
+        if arrival_ns is None:
+            return self
+        from lae_sim.engine.arrivals import arrival_clock
+
+        return arrival_clock(self.ticks_per_ns, self.frame_ticks, arrival_ns)
 
     @property
     def fps(self) -> Fraction:
         """World frames per second."""
         return Fraction(self.ticks_per_ns * NS_PER_SECOND, self.frame_ticks)
 
+    def arrival(self, frame: Count) -> Count:
+        """The tick at which a frame arrives, or int64 [n] of n frames."""
+        return frame * self.frame_ticks
+
+    def newest(self, tick: Count) -> Count:
+        """The newest frame that has arrived at a tick, equality counts."""
+        return tick // self.frame_ticks
+
+    def end(self, length: int) -> int:
+        """The tick at which a stream of so many frames ends: an interval after the last one."""
+        return length * self.frame_ticks
+
+    def tail_shrinks(self, newest: Count, now: Count, later: int) -> Any:
+        """Whether an answer at ``now + later`` has a shorter tail than one at ``now``, bool.
+
+        A tail is the time since the newest frame arrived. Where ``later`` is at most the interval
+        from that frame to the next, it does not count as shorter.
+
+        Args:
+            newest: the newest frame that has arrived at ``now``.
+            now: a tick.
+            later: ticks from it to another.
+        """
+        interval = self.frame_ticks  # a tail shrinks where adding to it reaches an arrival
+        return later > interval and now - newest * interval >= interval - later % interval
+
+    def frame_time(self, frame: Count) -> Any:
+        """When a frame arrives, in nominal frame intervals after frame 0: its number, or a float.
+
+        It is its number where frames arrive evenly. Elsewhere it is a float, and of a single frame
+        a :class:`.arrivals.FrameTime`, which knows the number as well.
+        """
+        return frame
+
     def milliseconds(self, frames: Fraction | int) -> float:
         """A time given in frames as milliseconds, for display."""
         return float(frames / self.fps * 1000)
+
+    def arrival_ms(self, frame: int, sigma: Fraction = Fraction(0)) -> float:
+        """When a frame's query is, ``sigma`` nominal intervals after its arrival, for display."""
+        return self.milliseconds(Fraction(self.arrival(frame), self.frame_ticks) + sigma)
+
+    def query(self, frame: int, sigma: Fraction = Fraction(0)) -> int:
+        """The tick of that query, or the one before where it is between two ticks."""
+        return self.arrival(frame) + int(sigma * self.frame_ticks // 1)

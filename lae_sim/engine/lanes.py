@@ -3,7 +3,8 @@
 A lane is one sequence under one configuration. Lanes know nothing of each other, so the k-th calls
 of all of them are one step of array arithmetic, on the same integer ticks. What cannot be a lane
 goes through the SimPy engine: a service that does not know its times beforehand, a policy that
-looks at more than the last call, instants beyond 64 bits, and whatever ends in an error.
+looks at more than the last call, frames that arrive at times of their own, instants beyond 64 bits,
+and whatever ends in an error.
 """
 
 from __future__ import annotations
@@ -33,13 +34,16 @@ def batchable(services: Sequence[Service], policy: Policy) -> bool:
 
 
 def simulate_lanes(
-    lengths: Sequence[int], clock: Clock, services: Sequence[Service], policy: Policy
+    lengths: Sequence[int],
+    clock: Clock | Sequence[Clock],
+    services: Sequence[Service],
+    policy: Policy,
 ) -> Iterator[Schedule]:
     """Schedule sequences as :func:`.scheduler.simulate` does each, at once where possible.
 
     Args:
         lengths: number of world frames of each sequence.
-        clock: of the world.
+        clock: of the world, or that of each sequence.
         services: one for each sequence, not yet asked for any time.
         policy: which frame is next.
 
@@ -49,15 +53,17 @@ def simulate_lanes(
     Raises:
         LaeError: what ``simulate`` raises, when that sequence's turn comes.
     """
+    clocks = [clock] * len(lengths) if isinstance(clock, Clock) else clock
     schedules: list[Schedule | None] = [None] * len(lengths)
-    if len(lengths) >= _FEWEST and min(lengths) > 0 and batchable(services, policy):
+    even = len(set(clocks)) == 1 and clocks[0].is_even
+    if even and len(lengths) >= _FEWEST and min(lengths) > 0 and batchable(services, policy):
         times, rule = cast("Sequence[Times]", services), cast(LanePolicy, policy)
         for lanes in _chunks(lengths):
-            sizes = np.array([lengths[i] for i in lanes])
-            for i, schedule in zip(lanes, _together(sizes, clock, [times[i] for i in lanes], rule)):
+            sizes, some = np.array([lengths[i] for i in lanes]), [times[i] for i in lanes]
+            for i, schedule in zip(lanes, _together(sizes, clocks[0], some, rule)):
                 schedules[i] = schedule
-    for length, service, schedule in zip(lengths, services, schedules):
-        yield schedule or simulate(length, clock, service, policy)
+    for length, of, service, schedule in zip(lengths, clocks, services, schedules):
+        yield schedule or simulate(length, of, service, policy)
 
 
 def _chunks(lengths: Sequence[int]) -> Iterator[list[int]]:

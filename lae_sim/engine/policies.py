@@ -2,8 +2,8 @@
 
 Each is a plain function of the clock and the calls so far (see :data:`.scheduler.Policy`), or
 makes one. The last call's frame is the last one processed, the tick when it was ready is *now*, and
-``now // clock.frame_ticks`` is the newest frame that has arrived (equality counts). Those that need
-no more than these two say so by a second method, :class:`LanePolicy`.
+``clock.newest(now)`` is the newest frame that has arrived (equality counts). Those that need no
+more than these two say so by a second method, :class:`LanePolicy`.
 """
 
 from __future__ import annotations
@@ -11,16 +11,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeVar
+from typing import ClassVar, Protocol
 
 import numpy as np
 
-from lae_sim._arrays import Ints
+from lae_sim._arrays import Count, Ints
 from lae_sim.engine.clock import Clock, duration_ns
 from lae_sim.engine.scheduler import Call, Policy
-
-Frames = TypeVar("Frames", int, Ints)
-"""Frames or ticks: of one sequence, or int64 [lanes]."""
 
 
 class LanePolicy(Protocol):
@@ -39,11 +36,11 @@ class LanePolicy(Protocol):
         """
 
 
-def _later(a: Frames, b: Frames) -> Frames:
+def _later(a: Count, b: Count) -> Count:
     """The greater of two frames, or of each two."""
     if type(a) is int:  # np.maximum on two numbers takes as long as the rest of the engine
         return a if a > b else b
-    greater: Frames = np.maximum(a, b)
+    greater: Count = np.maximum(a, b)
     return greater
 
 
@@ -55,13 +52,13 @@ class _ByLastCall(ABC):
     """
 
     @abstractmethod
-    def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
+    def next_lanes(self, clock: Clock, last: Count, now: Count) -> Count:
         """As in :class:`LanePolicy`; of numbers, a number."""
 
     def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         last, _, now = calls[-1]
         frame = self.next_lanes(clock, last, now)
-        arrival = frame * clock.frame_ticks
+        arrival = clock.arrival(frame)
         return frame, now if now > arrival else arrival
 
 
@@ -71,13 +68,13 @@ class _Latest(_ByLastCall):
 
     def __call__(self, clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         last, _, now = calls[-1]  # of most replays, so without the rule's detours
-        newest = now // clock.frame_ticks
+        newest = clock.newest(now)
         if newest > last:
             return newest, now
-        return last + 1, (last + 1) * clock.frame_ticks
+        return last + 1, clock.arrival(last + 1)
 
-    def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
-        return _later(now // clock.frame_ticks, last + 1)
+    def next_lanes(self, clock: Clock, last: Count, now: Count) -> Count:
+        return _later(clock.newest(now), last + 1)
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ class _Every(_ByLastCall):
     def label(self) -> str:
         return "fifo" if self.n == 1 else f"every:{self.n}"
 
-    def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
+    def next_lanes(self, clock: Clock, last: Count, now: Count) -> Count:
         return last + min(self.n, _BEYOND)
 
 
@@ -100,14 +97,11 @@ class _ShrinkingTail(_ByLastCall):
     def label(self) -> str:
         return f"shrinking-tail:{self.expected_ns}ns"
 
-    def next_lanes(self, clock: Clock, last: Frames, now: Frames) -> Frames:
-        interval = clock.frame_ticks
-        newest = now // interval
+    def next_lanes(self, clock: Clock, last: Count, now: Count) -> Count:
+        newest = clock.newest(now)
         expected = self.expected_ns * clock.ticks_per_ns
-        if expected > interval:  # tails shrink where adding the expected one reaches an arrival
-            waits = now - newest * interval >= interval - expected % interval
-            newest = newest + waits
-        return _later(newest, last + 1)
+        chosen: Count = newest + clock.tail_shrinks(newest, now, expected)
+        return _later(chosen, last + 1)
 
 
 _BEYOND = 2**40  # no sequence has so many frames
@@ -129,7 +123,9 @@ def shrinking_tail(expected: str | None = None, *, ns: int | None = None) -> Lan
 
     Li, Wang and Ramanan, "Towards Streaming Perception" (2020), Alg. 1: with the tail
     tau(t) = t - floor(t) in frames, a tracker that becomes free at s and needs r > 1 frames waits
-    iff tau(s + r) < tau(s). A tracker that needs at most one frame interval never waits.
+    iff tau(s + r) < tau(s). A tracker that needs at most one frame interval never waits. Where
+    frames arrive at times of their own, tau(t) is the time since the last arrival up to t, and the
+    interval is the one from the newest frame to the next, as if the camera announced its frames.
 
     Args:
         expected: the expected processing time r with its unit, such as ``"47ms"``.
@@ -147,7 +143,7 @@ def listed(frames: Sequence[int]) -> Policy:
     def next_listed(clock: Clock, calls: Sequence[Call]) -> tuple[int, int]:
         _, _, now = calls[-1]
         frame = frames[len(calls)] if len(calls) < len(frames) else frames[-1] + _BEYOND
-        return frame, max(now, frame * clock.frame_ticks)
+        return frame, max(now, clock.arrival(frame))
 
     return next_listed
 
@@ -169,7 +165,7 @@ class _VotRealtime:
         if overtime > interval and _late_calls(calls, interval, self.grace + 1) > self.grace:
             skipped = -(-overtime // interval) - 1
         following = last + 1 + skipped
-        return following, following * interval
+        return following, clock.arrival(following)
 
 
 def vot_realtime(grace: int = 3) -> Policy:
@@ -179,7 +175,8 @@ def vot_realtime(grace: int = 3) -> Policy:
     than the frame interval owes its overtime: while more than one interval is owed, a frame is
     skipped and one interval repaid; what is left is forgiven. The first ``grace`` calls over time
     owe nothing (VOT 2022: 3). The toolkit scores each output at its own frame, and so does
-    whatever evaluates such a schedule (see :class:`.scheduler.Schedule`).
+    whatever evaluates such a schedule (see :class:`.scheduler.Schedule`). It knows frames, not
+    times: the interval is the nominal one also where frames arrive at times of their own.
     """
     return _VotRealtime(grace)
 

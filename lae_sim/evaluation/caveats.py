@@ -77,6 +77,25 @@ def search_notes(search: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def _notes_on_absence(replay: ReplayStatistics, convention: Convention) -> list[str]:
+    """What becomes of frames whose target is said to be absent."""
+    sequences, silent = len(replay.sequences), int((replay.absent < 0).sum())
+    if convention.by_visible and silent:
+        where = "" if silent == sequences else f" in {silent} of {sequences} sequences"
+        return [
+            f"nothing says{where} where the target is absent: {convention.name} counts every frame "
+            "with a truth there"
+        ]
+    scored = np.where(replay.scored, np.maximum(replay.absent, 0), 0)
+    if convention.by_visible or not scored.any():
+        return []
+    return [
+        f"{scored.sum():,} frames in {int((scored > 0).sum())} of {sequences} sequences are scored "
+        f"by {convention.name} although their target is said to be absent; --convention lasot "
+        "leaves them out"
+    ]
+
+
 def notes_on(
     replay: ReplayStatistics,
     metadata: Metadata,
@@ -95,7 +114,9 @@ def notes_on(
     if truthless := replay.truthless[replay.scored].sum():
         counted = "leaves them out" if convention.leaves_out else "counts them as missed by AUC"
         counted += "" if convention.leaves_out else " and hit by DP"
+        counted += ", but divides by all frames" if convention.of_all else ""
         notes.append(f"{truthless:,} frames have no ground truth; {convention.name} {counted}")
+    notes += _notes_on_absence(replay, convention)
     if replay.missing.any():
         which = "the trace lacks" if replay.missing.all() else "some sequences lack"
         notes.append(f"no offline score, nothing recovered: {which} the boxes of skipped frames")
@@ -130,6 +151,12 @@ def notes_on(
         notes.append(
             f"kalman-lae-pvt does not clip forecasts where the image size is unknown, as it is of "
             f"{unknown} of {len(sequences)} sequences"
+        )
+    resized = [name for name in metadata.resized if name in set(sequences)]
+    if resized:
+        notes.append(
+            f"the images of {len(resized)} of {len(sequences)} sequences change size, such as "
+            f"those of {resized[0]!r}: clipping and search regions follow"
         )
     for name, factory in forecasters.items():
         notes += [f"{name}: {note}" for note in notes_of(factory, sequences)]

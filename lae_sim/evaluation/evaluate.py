@@ -21,7 +21,7 @@ from lae_sim.evaluation.scoring import Scored, Scorer
 from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run
 from lae_sim.trace.file import Trace
-from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.metadata import ImageSizes, Metadata
 from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
 
 Record = TypeVar("Record", "Staleness", "Curves")
@@ -40,6 +40,8 @@ class ReplayStatistics:
         sequences: names, S of them.
         frames: world frames of each, int64 [S].
         truthless: world frames of each that have no ground truth, int64 [S].
+        absent: world frames of each whose target is said to be absent though they have a truth,
+            int64 [S]; -1 where nothing is said.
         scored: whether each has a truth to score by (:func:`.metrics.is_scored`), bool [S].
         missing: world frames of each without a box in the trace, int64 [S].
         processed: processed frames of each, int64 [S].
@@ -57,6 +59,7 @@ class ReplayStatistics:
     sequences: tuple[str, ...]
     frames: Ints
     truthless: Ints
+    absent: Ints
     scored: Bools
     missing: Ints
     processed: Ints
@@ -102,11 +105,21 @@ class Staleness:
     Attributes:
         mismatch_sum, mismatch_max: over the world frames, frames, int64 [S, M].
         longest_hold: most queries in a row with one answering output, frames, int64 [S, M].
+        age_sum, age_max, longest_stale: the same in time, by when frames arrive, in nominal frame
+            intervals, float64 [S, M]; the permitted latency is not in it.
     """
 
     mismatch_sum: Ints
     mismatch_max: Ints
     longest_hold: Ints
+    age_sum: Floats
+    age_max: Floats
+    longest_stale: Floats
+
+    @classmethod
+    def of(cls, pairing: Pairing) -> Staleness:
+        """That of paired outputs and queries."""
+        return cls(*(getattr(pairing, field.name) for field in fields(cls)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +145,8 @@ class Evaluation:
         scores: per metric of ``METRICS``, float64 [F, S, M] in 0..1; NaN = leaves the mean.
         failure: the first world frame whose answer does not overlap the truth at all, int64
             [F, S, M]; the number of world frames if there is none, -1 without a truth to score by.
+        failure_time: when that frame arrives, or the stream ends, in nominal frame intervals,
+            float64 [F, S, M]; -1 without a truth to score by.
         curves: at one permitted latency, [F, S, ...].
         offline: per metric, of the trace's boxes at their own frames, float64 [S]; NaN where the
             trace does not hold every frame.
@@ -143,6 +158,7 @@ class Evaluation:
     staleness: Staleness
     scores: Mapping[str, Floats]
     failure: Ints
+    failure_time: Floats
     curves: Curves
     offline: Mapping[str, Floats]
     offline_curves: Curves
@@ -156,6 +172,7 @@ class Evaluation:
             staleness=_joined([part.staleness for part in parts]),
             scores={m: np.concatenate([p.scores[m] for p in parts], axis=1) for m in METRICS},
             failure=np.concatenate([part.failure for part in parts], axis=1),
+            failure_time=np.concatenate([part.failure_time for part in parts], axis=1),
             curves=_joined([part.curves for part in parts], axis=1),
             offline={m: np.concatenate([p.offline[m] for p in parts]) for m in METRICS},
             offline_curves=_joined([part.offline_curves for part in parts]),
@@ -219,7 +236,7 @@ def evaluate_runs(
     """Score the runs of one trace, in groups, so that no more than the scores is kept.
 
     Args:
-        runs: one per sequence, all of one clock.
+        runs: one per sequence, all of one frame rate.
         metadata: of the trace, for image sizes.
         forecasters: factories by name.
         sigmas: distinct permitted latencies in frames, ascending.
@@ -295,12 +312,13 @@ class _Offline:
     """What is scored of a recording alone, however it is replayed.
 
     Attributes:
-        truthless, scored, missing: see :class:`ReplayStatistics`.
+        truthless, absent, scored, missing: see :class:`ReplayStatistics`.
         scores: in the order of ``METRICS``.
         success, precision: see :class:`Curves`.
     """
 
     truthless: int
+    absent: int
     scored: bool
     missing: int
     scores: Sequence[float]
@@ -320,6 +338,7 @@ def _offline(
         for r, recording in enumerate(new):
             scored[recording] = _Offline(
                 truthless=int(np.isnan(recording.truth[:, 0]).sum()),
+                absent=_absent(recording),
                 scored=is_scored(recording.truth),
                 missing=int(np.isnan(recording.boxes[:, 0]).sum()),
                 scores=scores[r],
@@ -327,6 +346,13 @@ def _offline(
                 precision=offline.precision[r],
             )
     return {recording: value for recording, value in scored.items() if value is not None}
+
+
+def _absent(recording: Recording) -> int:
+    """How many frames with a truth are said to lack the target; -1 if nothing is said."""
+    if recording.visible is None:
+        return -1
+    return int((~recording.visible & ~np.isnan(recording.truth[:, 0])).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,17 +376,19 @@ class _Scoring:
         kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs]
         scored = self._scored(runs, pairings, kept)
         scores = {m: np.stack([each.scores[m] for each in scored]) for m in METRICS}
+        failure = np.stack([each.failure for each in scored])
+        of_sequence = np.broadcast_to(np.arange(len(runs))[:, None], failure.shape)
+        failed_at = pairings[0].frame_times(of_sequence, np.maximum(failure, 0))
         for place, run in enumerate(runs if self.observers else ()):
             one = ScoredRun(run, kept[place], place, self.sigmas, pairings)
             for observer in self.observers:
                 observer(one)
         return Evaluation(
             replay=_replay_statistics(runs, offline, pairings[0]),
-            staleness=Staleness(
-                pairings[0].mismatch_sum, pairings[0].mismatch_max, pairings[0].longest_hold
-            ),
+            staleness=Staleness.of(pairings[0]),
             scores=scores,
-            failure=np.stack([each.failure for each in scored]),
+            failure=failure,
+            failure_time=np.where(failure < 0, -1.0, failed_at),
             curves=Curves(
                 np.stack([each.success for each in scored]),
                 np.stack([each.precision for each in scored]),
@@ -438,6 +466,7 @@ def _replay_statistics(
         sequences=tuple(run.recording.name for run in runs),
         frames=pairing.lengths,
         truthless=np.array([each.truthless for each in offline], np.int64),
+        absent=np.array([each.absent for each in offline], np.int64),
         scored=np.array([each.scored for each in offline]),
         missing=np.array([each.missing for each in offline], np.int64),
         processed=np.diff(pairing.offsets),
@@ -499,19 +528,39 @@ def _answers_at(m: int, pairing: Pairing, part: PairedBoxes) -> Iterator[tuple[i
         yield int(sequence[begin]), Answers(source_frame[begin:end], answered[begin:end])
 
 
-def lanes_of(runs: Sequence[Run], pairing: Pairing, fed: Histories, image_sizes: Floats) -> Lanes:
+def lanes_of(
+    runs: Sequence[Run],
+    pairing: Pairing,
+    fed: Histories,
+    image_sizes: Sequence[ImageSizes | None],
+) -> Lanes:
     """What forecasters are fed in some histories of some runs.
 
     Args:
         runs: those that were paired.
         pairing: of their schedules.
         fed: histories of the pairing.
-        image_sizes: of each run, float64 [S, 2], infinite = unknown.
+        image_sizes: of each run; None = unknown.
     """
     boxes = np.concatenate([run.boxes for run in runs])
-    frames = pairing.frames.take(fed.output)
+    numbers = pairing.frames.take(fed.output)
+    frames = pairing.frame_times(np.repeat(fed.sequence, np.diff(fed.offsets)), numbers)
     fed_boxes = boxes.take(fed.output, axis=0)
-    return Lanes(fed.offsets, frames, fed_boxes, image_sizes[fed.sequence])
+    first = [(np.inf, np.inf) if sizes is None else sizes.at(0) for sizes in image_sizes]
+    resized: dict[int, ImageSizes] = {}
+    for s, sizes in enumerate(image_sizes):
+        if sizes is not None and sizes.change:
+            starts = pairing.frame_times(np.full(len(sizes.starts), s), np.array(sizes.starts))
+            timed = ImageSizes(tuple(starts.tolist()), sizes.sizes)
+            resized |= {int(lane): timed for lane in np.flatnonzero(fed.sequence == s)}
+    return Lanes(
+        fed.offsets,
+        frames,
+        fed_boxes,
+        np.array(first, np.float64)[fed.sequence],
+        None if frames is numbers else numbers,
+        resized,
+    )
 
 
 def _answers(
@@ -530,8 +579,7 @@ def _answers(
         raise LaeError(
             f"{name} sees frames when they arrive: not before, as sigma < 0 would have it"
         )
-    sizes = [metadata.image_size(run.recording.name) or (np.inf, np.inf) for run in runs]
-    image_sizes = np.array(sizes, np.float64)
+    image_sizes = [metadata.image_sizes(run.recording.name) for run in runs]
     with explained(name):
         factories = (
             [factory.for_sequence(run.recording) for run in runs]
@@ -541,13 +589,19 @@ def _answers(
     for fed in histories(pairing, memoryless=defines(factory, "memoryless")).parts(_PART):
         paired = pairs(pairing, fed)
         lanes = lanes_of(runs, pairing, fed, image_sizes)
+        frame: Ints | Floats = paired.frame
+        number: Ints | None = None
+        if lanes.numbers is not None:
+            sequence = fed.sequence.take(lanes.lane(paired.item))
+            frame, number = pairing.frame_times(sequence, paired.frame), paired.frame
         distinct = {id(one): one for one in factories}.values()
         if len(distinct) == 1:
-            yield fed, paired, forecast(factories[0], lanes, paired.item, paired.frame, name)
+            yield fed, paired, forecast(factories[0], lanes, paired.item, frame, name, number)
             continue
         answered = np.empty((len(paired.item), 4))
         for one in distinct:  # at once where several sequences share one
             chosen = np.array([other is one for other in factories])[fed.sequence]
             part, asked, item = lanes.chosen(chosen, paired.item)
-            answered[asked] = forecast(one, part, item, paired.frame[asked], name)
+            some = None if number is None else number[asked]
+            answered[asked] = forecast(one, part, item, frame[asked], name, some)
         yield fed, paired, answered

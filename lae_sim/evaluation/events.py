@@ -66,7 +66,7 @@ def event_log(run: Run, sigma: Number = Fraction(0), pairing: Pairing | None = N
 
 def _world(run: Run) -> Iterator[Event]:
     for frame in range(run.schedule.length):
-        yield Event(frame * run.schedule.clock.frame_ticks, "frame arrived", frame)
+        yield Event(run.schedule.clock.arrival(frame), "frame arrived", frame)
 
 
 def _tracker(run: Run) -> Iterator[Event]:
@@ -81,15 +81,15 @@ def _tracker(run: Run) -> Iterator[Event]:
         yield Event(ready, "output ready", frame)
         expected = frame + 1
     for skipped in range(expected, schedule.length):
-        yield Event(schedule.length * schedule.clock.frame_ticks, "frame skipped", skipped)
+        yield Event(schedule.clock.end(schedule.length), "frame skipped", skipped)
 
 
 def _queries(run: Run, sigma: Fraction, pairing: Pairing) -> Iterator[Event]:
-    interval = run.schedule.clock.frame_ticks
+    clock = run.schedule.clock
     spans = zip(pairing.frames.tolist(), pairing.first[:, 0].tolist(), pairing.end[:, 0].tolist())
     for source, first, end in spans:
         for frame in range(first, end):
-            tick = int((frame + sigma) * interval // 1)
+            tick = clock.query(frame, sigma)
             if frame == first and source > 0:
                 yield Event(tick, "forecaster updated", source)
             yield Event(tick, "query answered", frame, source)

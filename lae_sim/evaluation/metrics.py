@@ -35,6 +35,8 @@ class Convention:
             x, y, w, h > 0) or ``"finite"`` (no NaN).
         leaves_out: frames without a valid truth leave both metrics. Otherwise they are misses of
             success, and *hits* of precision.
+        by_visible: so do frames whose target is said to be absent, as if they had no truth.
+        of_all: shares are of all frames, those that are left out too.
         by_centre: the truth counts for precision where its centre is > 0 in x and y. Otherwise, and
             where frames are left out, it counts where it does for success.
         thresholds: number of IoU thresholds, evenly spaced from 0 to 1.
@@ -47,6 +49,8 @@ class Convention:
     name: str
     valid: Literal["size", "positive", "finite"]
     leaves_out: bool = False
+    by_visible: bool = False
+    of_all: bool = False
     by_centre: bool = True
     thresholds: int = 21
     first_frame_is_truth: bool = False
@@ -58,6 +62,17 @@ class Convention:
         """IoU thresholds, float64, ascending."""
         steps = self.thresholds - 1
         return np.arange(self.thresholds) / steps
+
+    def truth_of(self, truth: Floats, visible: Bools | None) -> Floats:
+        """The truth that answers are held against, float64 [T, 4]; NaN = none.
+
+        Args:
+            truth: of every world frame, float64 [T, 4].
+            visible: False where the target is said to be absent, bool [T]; None = nothing is said.
+        """
+        if not self.by_visible or visible is None:
+            return truth
+        return np.where(visible[:, None], truth, np.nan)
 
     def valid_success(self, truth: Floats) -> Bools:
         """Where the truth counts for success, bool [n]."""
@@ -99,6 +114,9 @@ CONVENTIONS = {
             keeps_answer=True,
             drops_zeros=True,
         ),
+        # calc_seq_err_robust.m and eval_tracker.m of the LaSOT toolkit: absent frames are removed,
+        # and the sums divided by all frames (https://github.com/HengLan/LaSOT_Evaluation_Toolkit)
+        Convention("lasot", "finite", leaves_out=True, by_visible=True, of_all=True),
         Convention("got10k", "finite", leaves_out=True),
         Convention("got10k-101", "finite", leaves_out=True, thresholds=101),
         Convention("exclude", "size", leaves_out=True),
@@ -109,7 +127,7 @@ CONVENTIONS = {
 Example:
     >>> import lae_sim
     >>> list(lae_sim.CONVENTIONS)
-    ['pysot', 'elae', 'otb', 'got10k', 'got10k-101', 'exclude']
+    ['pysot', 'elae', 'otb', 'lasot', 'got10k', 'got10k-101', 'exclude']
     >>> lae_sim.CONVENTIONS["got10k"].leaves_out
     True
 """
@@ -245,33 +263,43 @@ def _length(x: Floats, y: Floats) -> Floats:
     return np.sqrt(length, out=length)
 
 
-def success_curve(truth: Floats, answers: Floats, convention: Convention) -> Floats:
+def success_curve(
+    truth: Floats, answers: Floats, convention: Convention, visible: Bools | None = None
+) -> Floats:
     """Success over the convention's IoU thresholds for one sequence, float64 [thresholds].
 
     It is NaN without a truth to score by (:func:`is_scored`).
 
     Args:
         truth, answers: boxes of every world frame, float64 [T, 4].
+        convention: which frames count.
+        visible: False where the target is said to be absent, bool [T]; None = nothing is said.
     """
     answers = answers[convention.kept(answers)]
-    counts = frame_counts(truth, answers, np.arange(len(truth)), convention)
+    known = convention.truth_of(truth, visible)
+    counts = frame_counts(known, answers, np.arange(len(truth)), convention)
     passed = counts.success[:, None] > np.arange(convention.thresholds)
-    return _shares(passed, convention.valid_success(truth), truth, convention)
+    return _shares(passed, convention.valid_success(known), truth, convention)
 
 
-def precision_curve(truth: Floats, answers: Floats, convention: Convention) -> Floats:
+def precision_curve(
+    truth: Floats, answers: Floats, convention: Convention, visible: Bools | None = None
+) -> Floats:
     """Precision over 0, 1, ..., 50 px for one sequence, float64 [51].
 
     It is NaN without a truth to score by (:func:`is_scored`).
 
     Args:
         truth, answers: boxes of every world frame, float64 [T, 4].
+        convention: which frames count.
+        visible: False where the target is said to be absent, bool [T]; None = nothing is said.
     """
     answers = answers[convention.kept(answers)]
     if convention.first_frame_is_truth:
         answers = np.concatenate([truth[:1], answers[1:]])
-    valid = convention.valid_precision(truth)
-    error = np.where(valid, _length(*(centre(answers) - centre(truth)).T), -1.0)
+    known = convention.truth_of(truth, visible)
+    valid = convention.valid_precision(known)
+    error = np.where(valid, _length(*(centre(answers) - centre(known)).T), -1.0)
     return _shares(error[:, None] <= CENTRE_THRESHOLDS, valid, truth, convention)
 
 
@@ -279,6 +307,7 @@ def _shares(passed: Bools, valid: Bools, truth: Floats, convention: Convention) 
     """The share of the frames that count which passed each threshold, from bool [T, N]."""
     if convention.leaves_out:
         passed = passed[valid]
-    scored = len(passed) > 0 and is_scored(truth)
-    shares: Floats = passed.sum(axis=0) / (len(passed) if scored else np.nan)
+    frames = len(valid) if convention.of_all else len(passed)
+    scored = frames > 0 and is_scored(truth)
+    shares: Floats = passed.sum(axis=0) / (frames if scored else np.nan)
     return shares

@@ -3,12 +3,14 @@
 The query for world frame i happens at (i + sigma) / fps; its answer is the latest output that is
 ready by then, equality counts (PVT 2021, Eq. 5; sigma is from PVT++ 2023). With every sigma a
 multiple of 1/b frames, an output ready at tick t is visible at query (i, m/b) iff K <= b*i + m,
-where K = ceil(b*t / frame_ticks) is its *step*: all is integer from there on.
+where K = ceil(b*t / frame_ticks) is its *step*: all is integer from there on. Where frames arrive
+at times of their own, the query for frame i is m/b nominal intervals after its arrival a_i, and
+sees the output iff a_i >= t - floor(m*frame_ticks / b), again in integers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import lcm
@@ -17,8 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lae_sim._arrays import Bools, Ints
-from lae_sim.engine.clock import MAX_INT64
+from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim.engine.clock import MAX_INT64, Clock
 from lae_sim.engine.scheduler import Schedule
 from lae_sim.errors import LaeError
 
@@ -40,24 +42,27 @@ class Pairing:
         offsets: first output of each sequence, and n: int64 [S + 1].
         frames: source frame of each output, int64 [n].
         steps: step from which each output is visible, int64 [n]; hugely negative for the first
-            of a sequence, since the initial box is always there.
+            of a sequence, since the initial box is always there. None where frames of some sequence
+            arrive at times of their own.
         next_steps: step of the output after it, int64 [n]; huge for the last of a sequence.
         scale: b, steps per frame.
         sigmas: m for each permitted latency m/b, ascending, int64 [M].
         first: first world frame that each output answers, int32 [n, M].
         end: the frame after the last one it answers, int32 [n, M]; equal to ``first`` if it
             answers none.
+        clocks: of each sequence, S of them.
     """
 
     lengths: Ints
     offsets: Ints
     frames: Ints
-    steps: Ints
-    next_steps: Ints
+    steps: Ints | None
+    next_steps: Ints | None
     scale: int
     sigmas: Ints
     first: Frames
     end: Frames
+    clocks: tuple[Clock, ...]
 
     def chosen(self, sequence: int, sigma: int) -> Pairing:
         """That of one sequence at one of the permitted latencies, by their indices."""
@@ -67,12 +72,13 @@ class Pairing:
             self.lengths[sequence : sequence + 1],
             self.offsets[sequence : sequence + 2] - self.offsets[sequence],
             self.frames[outputs],
-            self.steps[outputs],
-            self.next_steps[outputs],
+            None if self.steps is None else self.steps[outputs],
+            None if self.next_steps is None else self.next_steps[outputs],
             self.scale,
             self.sigmas[sigmas],
             self.first[outputs, sigmas],
             self.end[outputs, sigmas],
+            self.clocks[sequence : sequence + 1],
         )
 
     @property
@@ -98,6 +104,74 @@ class Pairing:
     def longest_hold(self) -> Ints:
         """Most queries in a row that one output answered, frames, int64 [S, M]."""
         return self._largest_gap(self.first)
+
+    @property
+    def age_sum(self) -> Floats:
+        """Time from the arrival of each answer's frame to that of the frame it answers for.
+
+        Summed over the world frames of each sequence, nominal frame intervals, float64 [S, M]; at a
+        permitted latency of 0 that is how old the answers are. Where frames arrive evenly it is the
+        mismatch.
+        """
+        ages = self.mismatch_sum.astype(np.float64)
+        for s, clock in self._uneven():
+            outputs = slice(self.offsets[s], self.offsets[s + 1])
+            arrivals = clock.arrival(np.arange(self.lengths[s])) // clock.ticks_per_ns
+            answered = self.end[outputs].astype(np.int64) - self.first[outputs]
+            ns = arrivals.sum() - arrivals[self.frames[outputs]] @ answered
+            ages[s] = ns * (clock.ticks_per_ns / clock.frame_ticks)
+        return ages
+
+    @property
+    def age_max(self) -> Floats:
+        """The largest such time, nominal frame intervals, float64 [S, M]."""
+        last = np.maximum(self.end - 1, 0)  # see mismatch_max on outputs that answer nothing
+        return self._longest(self.mismatch_max, lambda o: (self.frames[o, None], last[o]))
+
+    @property
+    def longest_stale(self) -> Floats:
+        """Longest time that one output answered, nominal frame intervals, float64 [S, M].
+
+        It lasts until the query that another one answers, or until the end of the stream.
+        """
+        return self._longest(self.longest_hold, lambda o: (self.first[o], self.end[o]))
+
+    def _longest(self, frames: Ints, span: Callable[[slice], tuple[Any, Any]]) -> Floats:
+        """The longest span of frames, in nominal intervals, float64 [S, M].
+
+        Args:
+            frames: how many frames it has, int64 [S, M]: how long it is where they arrive evenly.
+            span: the first frame and the one after the last, of each of some outputs.
+        """
+        longest = frames.astype(np.float64)
+        for s, clock in self._uneven():
+            ticks = self._instants(s)
+            begin, end = span(slice(self.offsets[s], self.offsets[s + 1]))
+            longest[s] = (ticks[end] - ticks[begin]).max(axis=0) / clock.frame_ticks
+        return longest
+
+    def frame_times(self, sequence: Ints, frame: Ints) -> Ints | Floats:
+        """When frames of some sequences arrive, as forecasters count (see ``Clock.frame_time``).
+
+        Args:
+            sequence: by its place, int64 [P].
+            frame: world frame, int64 [P]; the one after the last is the end of the stream.
+        """
+        if all(clock.is_even for clock in self.clocks):
+            return frame
+        table = np.concatenate([self._instants(s) for s in range(len(self.clocks))])
+        starts = np.cumsum(self.lengths + 1) - self.lengths - 1
+        times: Floats = table.take(starts.take(sequence) + frame) / self.clocks[0].frame_ticks
+        return times
+
+    def _instants(self, sequence: int) -> Ints:
+        """The ticks at which the frames of a sequence arrive, and its end, int64 [T + 1]."""
+        clock, length = self.clocks[sequence], int(self.lengths[sequence])
+        return np.append(clock.arrival(np.arange(length)), clock.end(length))
+
+    def _uneven(self) -> Iterator[tuple[int, Clock]]:
+        """The sequences whose frames arrive at times of their own, by their places."""
+        return ((s, clock) for s, clock in enumerate(self.clocks) if not clock.is_even)
 
     def _largest_gap(self, begin: Frames) -> Ints:
         """The largest distance of ``end`` from another frame in each sequence, int64 [S, M]."""
@@ -130,18 +204,19 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
         raise LaeError("permitted latencies must be exact: Fraction(1, 2), not 0.5")
     if not sigmas or list(sigmas) != sorted(set(sigmas)):
         raise LaeError("permitted latencies must be ascending, each of them once")
-    if len({schedule.clock for schedule in schedules}) != 1:
+    clocks = tuple(schedule.clock for schedule in schedules)
+    if len({(clock.ticks_per_ns, clock.frame_ticks) for clock in clocks}) != 1:
         raise LaeError("sequences of different frame rates cannot be paired together")
     scored = {schedule.scores_latency for schedule in schedules}
     if len(scored) != 1:
         raise LaeError("sequences cannot be paired together if only some of them score latency")
     scale = lcm(*(sigma.denominator for sigma in sigmas))
     numerators = [int(sigma * scale) for sigma in sigmas]
-    interval = schedules[0].clock.frame_ticks
+    interval = clocks[0].frame_ticks
     lengths = np.array([schedule.length for schedule in schedules], np.int64)
     if cost_ns < 0:
         raise LaeError(f"forecasting cannot cost {cost_ns} ns, less than nothing")
-    cost = cost_ns * schedules[0].clock.ticks_per_ns
+    cost = cost_ns * clocks[0].ticks_per_ns
     last_ready = max(int(schedule.ready[-1]) for schedule in schedules) + cost
     if last_ready > MAX_INT64:
         raise LaeError(f"forecasting cannot cost {cost_ns:g} ns: the clock ends before")
@@ -155,25 +230,54 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
     counts = [len(schedule.frames) for schedule in schedules]
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     frames = np.concatenate([schedule.frames for schedule in schedules])
-    if scored == {False}:
-        steps = frames * scale
-    elif any((s.start[1:] < s.ready[:-1]).any() for s in schedules):
+    at_once = scored == {False}
+    if not at_once and any((s.start[1:] < s.ready[:-1]).any() for s in schedules):
         raise LaeError(
             "calls overlap, as under the rule of VOT, which never scores latency: such a policy "
             "says so by an attribute, scores_latency = False"
         )
-    else:
-        frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]) + cost, interval)
-        steps = frame * scale - (-rest * scale // interval)
-    steps[offsets[:-1]] = -_NEVER
-    next_steps = np.append(steps[1:], _NEVER)
-    next_steps[offsets[1:] - 1] = _NEVER
     m = np.array(numerators, np.int64)
-    first = _first_visible(steps, m, scale, np.repeat(lengths, counts))
+    steps: Ints | None = None
+    next_steps: Ints | None = None
+    if all(clock.is_even for clock in clocks):
+        if at_once:
+            steps = frames * scale
+        else:
+            frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]) + cost, interval)
+            steps = frame * scale - (-rest * scale // interval)
+        steps[offsets[:-1]] = -_NEVER
+        next_steps = np.append(steps[1:], _NEVER)
+        next_steps[offsets[1:] - 1] = _NEVER
+        first = _first_visible(steps, m, scale, np.repeat(lengths, counts))
+    else:
+        permitted = [each * interval // scale for each in numerators]
+        if last_ready + max(map(abs, permitted)) > MAX_INT64:
+            raise LaeError("the permitted latencies are too large for exact 64-bit arithmetic")
+        since = np.array(permitted, np.int64)
+        first = np.concatenate(
+            [
+                _first_arrived(s, s.clock.arrival(s.frames) if at_once else s.ready + cost, since)
+                for s in schedules
+            ]
+        )
     end = np.empty_like(first)
     end[:-1] = first[1:]
     end[offsets[1:] - 1] = lengths[:, None]
-    return Pairing(lengths, offsets, frames, steps, next_steps, scale, m, first, end)
+    return Pairing(lengths, offsets, frames, steps, next_steps, scale, m, first, end, clocks)
+
+
+def _first_arrived(schedule: Schedule, visible: Ints, permitted: Ints) -> Frames:
+    """The first frame whose query sees each output, within 0..T, int32 [n, M].
+
+    Args:
+        schedule: of one sequence.
+        visible: the tick from which each output is, int64 [n].
+        permitted: permitted latencies, whole ticks, int64 [M].
+    """
+    arrivals = schedule.clock.arrival(np.arange(schedule.length))
+    first = np.searchsorted(arrivals, visible[:, None] - permitted).astype(np.int32)
+    first[0] = 0  # the initial box is always there
+    return first
 
 
 def _first_visible(steps: Ints, sigmas: Ints, scale: int, lengths: Ints) -> Frames:
@@ -307,14 +411,25 @@ def pairs(pairing: Pairing, fed: Histories) -> Pairs:
         return listed
     output = fed.output.take(item.take(several))
     query = pairing.scale * frame.take(several)
-    for ends, steps, limit in (
-        (listed.sigma_from, pairing.steps, np.maximum),
-        (listed.sigma_to, pairing.next_steps, np.minimum),
+    for ends, steps, from_frame, limit in (
+        (listed.sigma_from, pairing.steps, pairing.first, np.maximum),
+        (listed.sigma_to, pairing.next_steps, pairing.end, np.minimum),
     ):
-        seen = _place(pairing.sigmas, steps.take(output) - query)
+        if steps is None:
+            seen = _count_above(from_frame, output, frame.take(several))
+        else:
+            seen = _place(pairing.sigmas, steps.take(output) - query)
         ends[several] = limit(seen, ends.take(several))
     kept = listed.sigma_from < listed.sigma_to
     return listed if kept.all() else listed.some(kept)
+
+
+def _count_above(rows: Frames, row: Ints, values: Ints) -> Ints:
+    """How many columns of each row are above a value, int64 [P]."""
+    count = np.zeros(len(row), np.int64)
+    for column in rows.T:
+        count += column.take(row) > values
+    return count
 
 
 def _place(sigmas: Ints, values: Ints) -> Ints:

@@ -47,10 +47,10 @@ class Scorer:
         self._convention = convention
         self._lengths = np.array([len(recording) for recording in recordings], np.int64)
         self._bases = np.cumsum(self._lengths) - self._lengths
-        self._truth = _columns([recording.truth for recording in recordings])
+        self._truth = _columns([convention.truth_of(r.truth, r.visible) for r in recordings])
         self._boxes = _columns([recording.boxes for recording in recordings])
         counted = self._lengths
-        if convention.leaves_out:
+        if convention.leaves_out and not convention.of_all:
             valid = convention.valid_success(self._truth.T)
             counted = np.add.reduceat(valid.astype(np.int64), self._bases)
         self._is_scored = np.array([is_scored(recording.truth) for recording in recordings])

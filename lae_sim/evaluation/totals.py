@@ -276,6 +276,9 @@ class Totals:
                 staleness.mismatch_sum.sum(axis=0, keepdims=True),
                 staleness.mismatch_max.max(axis=0, keepdims=True),
                 staleness.longest_hold.max(axis=0, keepdims=True),
+                staleness.age_sum.sum(axis=0, keepdims=True),
+                staleness.age_max.max(axis=0, keepdims=True),
+                staleness.longest_stale.max(axis=0, keepdims=True),
             )
         )
 
@@ -286,9 +289,12 @@ class Totals:
 
     @property
     def staleness(self) -> Staleness:
-        """How old the answers are over all sequences: the sum and the maxima, int64 [M]."""
+        """How old the answers are over all sequences: the sums and the maxima, [M]."""
         return Staleness(
             np.sum([each.mismatch_sum for each in self._staleness], axis=(0, 1)),
             np.max([each.mismatch_max for each in self._staleness], axis=(0, 1)),
             np.max([each.longest_hold for each in self._staleness], axis=(0, 1)),
+            np.sum([each.age_sum for each in self._staleness], axis=(0, 1)),
+            np.max([each.age_max for each in self._staleness], axis=(0, 1)),
+            np.max([each.longest_stale for each in self._staleness], axis=(0, 1)),
         )

@@ -10,6 +10,12 @@ predicts the box at any later frame. Anything with these two methods will do:
 
 The class itself is the factory; name it ``package.module:MyForecaster`` on the command line.
 
+A frame stands for the time when it arrives. Where frames arrive evenly that is its number, an int.
+Where they arrive at times of their own, as those of a camera that dropped some, it is a float, the
+time since frame 0 in nominal frame intervals: a frame that comes after a dropped one is 2 later
+than the one before. So differences of frames are intervals, whatever the world. Used as an index
+(``truth[frame]``) or by ``operator.index(frame)`` such a float is the frame's number.
+
 That is the *streaming* form, and all that a forecaster needs: :func:`forecast` feeds it box after
 box. A factory may have a second form for many sequences and permitted latencies at once, its
 *lanes* (:class:`LaneFactory`). The built-in ones that have it keep it as the only form, or nearly:
@@ -26,15 +32,18 @@ box. A factory may have a second form for many sequences and permitted latencies
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
+from operator import index
 from typing import Any, Optional, Protocol, runtime_checkable
 
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim.engine.arrivals import FrameTime
 from lae_sim.errors import LaeError, explained
+from lae_sim.trace.metadata import ImageSizes
 
 ImageSize = Optional[tuple[int, int]]
 """Width and height of the images in pixels, or None if unknown."""
@@ -43,7 +52,8 @@ ImageSize = Optional[tuple[int, int]]
 class Forecaster(Protocol):
     """One target's motion, from the outputs so far; boxes are ``x, y, w, h`` in pixels.
 
-    Any class with these methods will do; it is made with the first box and the image size.
+    Any class with these methods will do; it is made with the first box and the image size. One that
+    also has ``resize(image_size)`` is told before anything else when images have another size.
 
     Example:
         >>> import lae_sim
@@ -62,10 +72,30 @@ class Forecaster(Protocol):
     """
 
     def update(self, frame: int, box: Sequence[float]) -> None:
-        """Take in the box of a newer frame."""
+        """Take in the box of a newer frame.
+
+        Args:
+            frame: its number; where frames arrive at times of their own, a float: the time since
+                frame 0 in nominal frame intervals, and as an index the frame's number.
+            box: ``x, y, w, h`` in pixels.
+        """
 
     def predict(self, frame: int) -> Sequence[float]:
         """The box at a frame, from the boxes so far; may be asked many times, in any order."""
+
+
+@runtime_checkable
+class Resizable(Protocol):
+    """A forecaster that follows images which change size."""
+
+    def resize(self, image_size: ImageSize) -> None:
+        """What comes next is of images of this width and height, pixels."""
+
+
+def resize(forecaster: Forecaster, image_sizes: ImageSizes | None, frame: float) -> None:
+    """Tell a forecaster that follows it the size of a frame's image, if sizes change."""
+    if image_sizes is not None and image_sizes.change and isinstance(forecaster, Resizable):
+        forecaster.resize(image_sizes.at(frame))
 
 
 ForecasterFactory = Callable[[Sequence[float], ImageSize], Forecaster]
@@ -85,15 +115,20 @@ class Lanes:
     Attributes:
         offsets: first item of each lane, and N: int64 [lanes + 1]. A lane's first item is the
             initial box at frame 0.
-        frames: frame of each item, int64 [N].
+        frames: frame of each item, int64 [N]; float64, their times in nominal frame intervals,
+            where frames arrive at times of their own.
         boxes: box of each item, float64 [N, 4].
-        image_sizes: per lane, float64 [lanes, 2], infinite = unknown.
+        image_sizes: per lane, float64 [lanes, 2], infinite = unknown; of frame 0.
+        numbers: the frames' numbers, int64 [N], where ``frames`` are times.
+        resized: of lanes whose images change size, all their sizes, by ``frames``.
     """
 
     offsets: Ints
-    frames: Ints
+    frames: Ints | Floats
     boxes: Floats
     image_sizes: Floats
+    numbers: Ints | None = None
+    resized: Mapping[int, ImageSizes] = field(default_factory=dict)
 
     def lane(self, item: Ints) -> Ints:
         """The lane of each item, int64 [P]."""
@@ -105,6 +140,21 @@ class Lanes:
         first: Ints = self.offsets[self.lane(item)]
         return first
 
+    def image_sizes_at(self, item: Ints, frame: Ints | Floats) -> Floats:
+        """Width and height of frames' images in the lanes of some items, float64 [P, 2].
+
+        Args:
+            item: int64 [P], not decreasing.
+            frame: int64 [P], or float64, as ``frames`` are.
+        """
+        lane = self.lane(item)
+        sizes: Floats = self.image_sizes[lane]
+        for k, changing in self.resized.items():
+            begin, end = np.searchsorted(lane, [k, k + 1])
+            which = np.searchsorted(changing.starts, frame[begin:end], "right") - 1
+            sizes[begin:end] = np.array(changing.sizes)[which]
+        return sizes
+
     def chosen(self, lanes: Bools, item: Ints) -> tuple[Lanes, Bools, Ints]:
         """Some of the lanes, by a mark for each: bool [lanes].
 
@@ -113,11 +163,14 @@ class Lanes:
         """
         sizes = np.diff(self.offsets)
         kept = np.repeat(lanes, sizes)
+        place = np.cumsum(lanes) - 1
         part = Lanes(
             np.concatenate([[0], np.cumsum(sizes[lanes])]),
             self.frames[kept],
             self.boxes[kept],
             self.image_sizes[lanes],
+            None if self.numbers is None else self.numbers[kept],
+            {int(place[k]): sizes for k, sizes in self.resized.items() if lanes[k]},
         )
         inside = kept[item]
         return part, inside, (np.cumsum(kept) - 1)[item[inside]]
@@ -127,10 +180,12 @@ class Lanes:
 class LaneFactory(Protocol):
     """A factory that can also answer for many lanes at once, faster than box after box."""
 
-    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """Boxes for some frames, float64 [P, 4], each as of one of the lanes' items.
 
-        The arguments are those of :func:`forecast`.
+        The arguments are those of :func:`forecast`. A factory that looks things up by a frame's
+        number says so by an attribute, ``by_number = True``: where frames are times it is asked
+        box after box.
         """
 
 
@@ -200,7 +255,7 @@ class Hold:
         return self._box
 
     @staticmethod
-    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once."""
         boxes: Floats = lanes.boxes.take(item, axis=0)
         return boxes
@@ -226,7 +281,7 @@ class LastOutputs:
         count = len(frames)
         lane = Lanes(
             np.array([0, count]),
-            np.array(frames, np.int64),
+            np.array(frames),
             np.array(boxes, np.float64),
             np.full((1, 2), np.inf),
         )
@@ -242,10 +297,11 @@ class ConstantVelocity(LastOutputs):
         super().__init__(ConstantVelocity, 2, box)
 
     @staticmethod
-    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """Forecasts of many lanes at once."""
         before = np.maximum(item - 1, lanes.first(item))
-        interval = np.maximum(lanes.frames[item] - lanes.frames[before], 1).astype(np.float64)
+        interval = (lanes.frames[item] - lanes.frames[before]).astype(np.float64)
+        interval[interval == 0] = 1.0
         velocity = (lanes.boxes[item] - lanes.boxes[before]) / interval[:, None]
         ahead = (frame - lanes.frames[item]).astype(np.float64)
         boxes: Floats = lanes.boxes[item] + ahead[:, None] * velocity
@@ -267,7 +323,7 @@ class _Truth(Hold):
         self._truth = truth
 
     def predict(self, frame: int) -> Sequence[float]:
-        truth: list[float] = self._truth[min(frame, len(self._truth) - 1)].tolist()
+        truth: list[float] = self._truth[min(index(frame), len(self._truth) - 1)].tolist()
         return truth if truth[2] > 0 and truth[3] > 0 else super().predict(frame)
 
 
@@ -281,7 +337,12 @@ def defines(factory: AnyFactory, name: str) -> bool:
 
 
 def forecast(
-    factory: ForecasterFactory, lanes: Lanes, item: Ints, frame: Ints, name: str = "forecaster"
+    factory: ForecasterFactory,
+    lanes: Lanes,
+    item: Ints,
+    frame: Ints | Floats,
+    name: str = "forecaster",
+    number: Ints | None = None,
 ) -> Floats:
     """Forecasts of each lane's forecaster, each as of one of the lane's items.
 
@@ -289,8 +350,9 @@ def forecast(
         factory: makes the forecasters.
         lanes: what they are fed.
         item: index of the latest item that a forecast has seen, int64 [P], not decreasing.
-        frame: the frame it is for, int64 [P].
+        frame: the frame it is for, int64 [P]; its time, float64 [P], where the lanes have times.
         name: the forecaster's name, for messages.
+        number: the frame's number, int64 [P], where ``frame`` is its time.
 
     Returns:
         Boxes, float64 [P, 4].
@@ -299,7 +361,10 @@ def forecast(
         LaeError: if a forecaster fails, or answers anything but four finite numbers.
     """
     with explained(name):
-        if defines(factory, "forecast_lanes") and isinstance(factory, LaneFactory):
+        in_lanes = defines(factory, "forecast_lanes")
+        if number is not None and getattr(factory, "by_number", False):
+            in_lanes = False
+        if in_lanes and isinstance(factory, LaneFactory):
             boxes = np.asarray(factory.forecast_lanes(lanes, item, frame), np.float64)
             if boxes.shape != (len(item), 4):
                 raise LaeError(f"{name}: answered {boxes.shape}, not {(len(item), 4)}")
@@ -308,14 +373,25 @@ def forecast(
                 box, at = boxes[~good][0], frame[~good][0]
                 raise LaeError(f"{name}: predicted {box} for frame {at}, not a box x, y, w, h")
             return boxes
-        return _streamed(factory, lanes, item, frame, name)
+        return _streamed(factory, lanes, item, frame, name, number)
+
+
+def _frames(frame: Ints | Floats, number: Ints | None) -> list[Any]:
+    """Frames as forecasters are given them one by one."""
+    return frame.tolist() if number is None else list(map(FrameTime, frame, number.tolist()))
 
 
 def _streamed(
-    factory: ForecasterFactory, lanes: Lanes, item: Ints, frame: Ints, name: str
+    factory: ForecasterFactory,
+    lanes: Lanes,
+    item: Ints,
+    frame: Ints | Floats,
+    name: str,
+    number: Ints | None,
 ) -> Floats:
     """The forecasts of forecasters that are fed one box after another."""
     boxes = np.empty((len(item), 4))
+    fed_frames, asked = _frames(lanes.frames, lanes.numbers), _frames(frame, number)
     fed, current = -1, -1
     forecaster: Any = None
     for p, (i, k) in enumerate(zip(item.tolist(), lanes.lane(item).tolist())):
@@ -326,8 +402,10 @@ def _streamed(
             forecaster = factory(lanes.boxes[fed].tolist(), image_size)
         while fed < i:
             fed += 1
-            forecaster.update(int(lanes.frames[fed]), lanes.boxes[fed].tolist())
-        answer = forecaster.predict(int(frame[p]))
+            resize(forecaster, lanes.resized.get(k), fed_frames[fed])
+            forecaster.update(fed_frames[fed], lanes.boxes[fed].tolist())
+        resize(forecaster, lanes.resized.get(k), asked[p])
+        answer = forecaster.predict(asked[p])
         try:
             box = np.asarray(answer, np.float64)
         except (TypeError, ValueError, OverflowError):

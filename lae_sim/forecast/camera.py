@@ -17,8 +17,9 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from operator import index
 from time import perf_counter_ns
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +34,7 @@ from lae_sim.forecast.base import (
     ForecasterFactory,
     ImageSize,
     Lanes,
+    Resizable,
     Sequenced,
     factory_for,
     forecast,
@@ -273,16 +275,18 @@ class _Moving:
 
     base: ForecasterFactory
     outlooks: Complexes
+    by_number: ClassVar[bool] = True
 
     def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Forecaster:
         return _OnMoving(self, box)
 
-    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once."""
-        still = self.stilled(lanes.boxes, lanes.frames)
+        frames = cast(Ints, lanes.frames)  # since it is asked by number
+        still = self.stilled(lanes.boxes, frames)
         sizes = np.full_like(lanes.image_sizes, np.inf)
-        boxes = forecast(self.base, Lanes(lanes.offsets, lanes.frames, still, sizes), item, frame)
-        return self.moved(boxes, lanes.frames[item], frame)
+        boxes = forecast(self.base, Lanes(lanes.offsets, frames, still, sizes), item, frame)
+        return self.moved(boxes, frames[item], cast(Ints, frame))
 
     def stilled(self, boxes: Floats, frame: Ints) -> Floats:
         """Boxes of outputs mapped from their frames to frame 0."""
@@ -305,12 +309,12 @@ class _OnMoving:
         self._latest = 0
 
     def update(self, frame: int, box: Sequence[float]) -> None:
-        self._base.update(frame, self._stilled(frame, box))
-        self._latest = frame
+        self._latest = index(frame)
+        self._base.update(frame, self._stilled(self._latest, box))
 
     def predict(self, frame: int) -> Sequence[float]:
         still = np.array([self._base.predict(frame)], np.float64)
-        moved = self._factory.moved(still, np.array([self._latest]), np.array([frame]))
+        moved = self._factory.moved(still, np.array([self._latest]), np.array([index(frame)]))
         box: list[float] = moved[0].tolist()
         return box
 
@@ -335,12 +339,13 @@ class Closest:
     """
 
     several: tuple[ForecasterFactory, ...]
+    by_number: ClassVar[bool] = True
 
     def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Forecaster:
         """The forecasters of one sequence."""
         return _Several([factory(box, image_size) for factory in self.several])
 
-    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once."""
         fed = np.setdiff1d(np.arange(len(lanes.frames)), lanes.offsets[:-1])
         first, errors, boxes = lanes.first(item), [], []
@@ -367,6 +372,11 @@ class _Several:
         self._errors.append(_distance(predicted, np.array([box], np.float64)))
         for each in self._several:
             each.update(frame, box)
+
+    def resize(self, image_size: ImageSize) -> None:
+        for each in self._several:
+            if isinstance(each, Resizable):
+                each.resize(image_size)
 
     def predict(self, frame: int) -> Sequence[float]:
         best = int(np.argmin(sum(self._errors))) if self._errors else 0

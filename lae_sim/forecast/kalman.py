@@ -66,7 +66,7 @@ class TunedKalman:
         return Kalman(box, image_size, self)
 
     def forecast_lanes(
-        self, lanes: Lanes, item: Ints, frame: Ints, restart_iou: float | None = None
+        self, lanes: Lanes, item: Ints, frame: Ints | Floats, restart_iou: float | None = None
     ) -> Floats:
         """The same for many lanes at once; restarts as in :func:`filter_lanes`."""
         states, place = filter_lanes(lanes, self, restart_iou)
@@ -226,7 +226,7 @@ class Kalman:
         return self._settings.boxes(forecast[None])
 
     @staticmethod
-    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The paper's filter over many lanes at once; equal bit for bit."""
         return PAPER.forecast_lanes(lanes, item, frame)
 
@@ -243,12 +243,16 @@ class KalmanLaePvt(Kalman):
     def __init__(self, box: Sequence[float], image_size: ImageSize = None) -> None:
         super().__init__(box, restart_iou=RESTART_IOU)
         self._raw = np.array([box], np.float64)
-        self._size = np.array([image_size or (np.inf, np.inf)], np.float64)
+        self.resize(image_size)
 
     def update(self, frame: int, box: Sequence[float]) -> None:
         """Take in the box of a newer frame."""
         self._raw = np.array([box], np.float64)
         super().update(frame, box)
+
+    def resize(self, image_size: ImageSize) -> None:
+        """The next forecast is clipped to this width and height."""
+        self._size = np.array([image_size or (np.inf, np.inf)], np.float64)
 
     def predict(self, frame: int) -> Sequence[float]:
         """The box at a frame, from the boxes so far."""
@@ -256,10 +260,10 @@ class KalmanLaePvt(Kalman):
         return box
 
     @staticmethod
-    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once; equal bit for bit."""
         forecasts = PAPER.forecast_lanes(lanes, item, frame, RESTART_IOU)
-        return clip(forecasts, lanes.boxes[item], lanes.image_sizes[lanes.lane(item)])
+        return clip(forecasts, lanes.boxes[item], lanes.image_sizes_at(item, frame))
 
 
 def clip(forecasts: Floats, raw: Floats, image_sizes: Floats) -> Floats:

@@ -81,7 +81,7 @@ class Inputs:
     Attributes:
         velocities: of centre x and y in target sizes, and of the logarithms of width and height,
             per frame, newest first, [P, n, 4]; 0 where unknown.
-        intervals: frames between the outputs of each velocity, [P, n]; 0 where unknown.
+        intervals: frame intervals between the outputs of each velocity, [P, n]; 0 where unknown.
         ahead: frames from the newest output to the query, [P].
         shape: logarithms of the target's size (over 50 px) and aspect, [P, 2].
     """
@@ -101,7 +101,9 @@ class Inputs:
         scale = np.exp(sides[:, :1].mean(axis=2, keepdims=True))
         states = np.concatenate([centres / scale, sides], axis=2)
         intervals = (window.frames[:, :-1] - window.frames[:, 1:]) * window.known[:, 1:]
-        velocities = (states[:, :-1] - states[:, 1:]) / np.maximum(intervals, 1)[..., None]
+        velocities = (states[:, :-1] - states[:, 1:]) / np.where(intervals > 0, intervals, 1)[
+            ..., None
+        ]
         shape = [np.log(scale[:, 0, 0] / 50), sides[:, 0, 0] - sides[:, 0, 1]]
         parts = (velocities, intervals, np.maximum(ahead, 0), np.stack(shape, axis=1))
         return cls(*(torch.from_numpy(part.astype(np.float32)) for part in parts))

@@ -25,12 +25,12 @@ class Window:
         5  2  0    yes yes yes
 
     Attributes:
-        frames: frame of each, int64 [P, n].
+        frames: frame of each, int64 [P, n], or its time (see :class:`.base.Lanes`).
         boxes: box of each, float64 [P, n, 4].
         known: whether there is such an output, bool [P, n]; where not, the oldest one is repeated.
     """
 
-    frames: Ints
+    frames: Ints | Floats
     boxes: Floats
     known: Bools
 
@@ -73,7 +73,7 @@ class Windowed(Generic[AnyRule]):
         """The forecaster of one sequence."""
         return LastOutputs(self, self.rule.size, box)
 
-    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints) -> Floats:
+    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once; equal but for rounding."""
         ahead = (frame - lanes.frames[item]).astype(np.float64)
         boxes = np.empty((len(item), 4))

@@ -5,16 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
+from lae_sim.datasets.absence import absence_files, read_visible
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
+from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing, note
+from lae_sim.datasets.layouts import image_numbers
 from lae_sim.datasets.names import Reading, SequenceNames
 from lae_sim.engine.clock import Clock, Number, parse_fps
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, hint, listed, shown
 from lae_sim.importers.coordinates import other_reading, row_0_is_off
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.importers.results import (
@@ -60,12 +64,14 @@ class ConversionSummary:
         median_ms: median time of a processed frame, ms.
         times_read_as: the unit of measured times, in words; None where none were read.
         held: frames of each sequence in which the tracker had no box, and its last one stands.
+        frame_times: how frames come where image numbers are missing: ``"numbers"`` or ``"even"``;
+            None where none is, or no images are at hand.
         row_0_from_truth: sequences whose row 0 was more than 3 px off the initial box, from which
             the tracker started; in the trace it is that box.
         other_trackers: trackers whose results lie there too, and were left out.
         without_truth: results that were left out, since they have no ground truth.
         without_results: sequences of the ground truth that have no results.
-        notes: what else could not be read, and was left out.
+        notes: what else is to be said, a sentence each.
         files: what was read.
     """
 
@@ -81,6 +87,7 @@ class ConversionSummary:
     median_ms: float
     times_read_as: str | None
     held: Mapping[str, int]
+    frame_times: str | None
     row_0_from_truth: list[str]
     other_trackers: list[str]
     without_truth: list[str]
@@ -112,6 +119,7 @@ def convert_results(
     truth_files: Mapping[str, str | Path] | None = None,
     skip_missing: bool = False,
     image_size: tuple[int, int] | None = None,
+    frame_times: str | None = None,
     progress: Progress = lambda done, total: None,
 ) -> tuple[Trace, ConversionSummary]:
     """Make a trace from a tracker's results and the dataset's ground truth.
@@ -136,6 +144,8 @@ def convert_results(
         truth_files: other ground truth for some sequences, by name.
         skip_missing: whether results without ground truth are left out instead of refused.
         image_size: width and height of the images, pixels.
+        frame_times: where images are beside the ground truth and numbers are missing among them
+            (see :func:`lae_sim.datasets.layouts.find_dataset`).
         progress: called after each sequence.
 
     Returns:
@@ -153,7 +163,7 @@ def convert_results(
         ...     for name in ("results", "anno"):
         ...         pathlib.Path(folder, name).mkdir()
         ...         boxes = "1,2,30,40" if name == "anno" else "3,2,30,40"
-        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes)
+        ...         _ = pathlib.Path(folder, name, "car.txt").write_text(boxes, "utf-8")
         ...     trace, summary = lae_sim.convert_results(
         ...         f"{folder}/results", f"{folder}/anno", time="constant:47ms"
         ...     )
@@ -163,6 +173,7 @@ def convert_results(
     for name, path in (("results", results), ("truth", truth)):
         if not isinstance(path, (str, os.PathLike)):
             raise LaeError(f"{name}: a path, not {shown(path)}")
+    check_frame_times(frame_times)
     if repetition < 1:
         raise LaeError("--repetition counts from 1")
     parse_unit(time_unit)
@@ -202,13 +213,24 @@ def convert_results(
             raise LaeError("--time-unit is that of measured times, and none are read here")
     as_published = converted.recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
+    recordings, notes = _flagged(recordings, annotations)
+    incomplete: list[str] = []
+    if kind != "lae-pvt":  # whose recorded loop took the frames evenly, whatever their numbers
+        recordings, incomplete = _arrived(recordings, annotations, clock.fps, frame_times)
+    elif frame_times == "numbers":
+        raise LaeError(
+            "--frame-times numbers does not go with lae-pvt: its runs took frames evenly"
+        )
+    if incomplete and frame_times:
+        notes.append(note(incomplete, frame_times))
+    frame_times = frame_times if incomplete else None
     attributes = read_attributes(annotations)
     metadata = Metadata.new(
         rate,
         **schedule,
         tracker={"name": tracker},
         device={"model": device} if device else {},
-        dataset={"name": dataset},
+        dataset={"name": dataset, **({"frame_times": frame_times} if frame_times else {})},
         timing=converted.timing,
         sequences=_sequence_entries(matched, attributes.of, image_size),
     )
@@ -227,14 +249,18 @@ def convert_results(
         median_ms=float(np.median(elapsed[elapsed >= 0])) / 1e6,
         times_read_as=converted.times_read_as,
         held=converted.held,
-        row_0_from_truth=[new.name for new, old in zip(recordings, as_published) if new is not old],
+        frame_times=frame_times,
+        row_0_from_truth=[
+            new.name for new, old in zip(recordings, as_published) if new.boxes is not old.boxes
+        ],
         other_trackers=found.others,
         without_truth=found.without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
-        notes=list(attributes.notes),
+        notes=[*attributes.notes, *notes],
         files=[
             *(file for source in matched.values() for file in (source.path, source.times) if file),
             *annotations.files.values(),
+            *(file for truth in annotations.files.values() for file in absence_files(truth)),
             *((given.file,) if given and given.file else ()),
         ],
     )
@@ -503,6 +529,50 @@ def _started(recording: Recording, results: Path) -> Recording:
     return replace(recording, boxes=np.concatenate([truth[:1], boxes[1:]]))
 
 
+def _arrived(
+    recordings: list[Recording], truth: GroundTruth, fps: Fraction, frame_times: str | None
+) -> tuple[list[Recording], list[str]]:
+    """The recordings with the times of their frames, and in which image numbers are missing.
+
+    Raises:
+        LaeError: if some are, and it is not said how the frames come.
+    """
+    numbers = {
+        each.name: image_numbers(truth.root, each.name, truth.files[each.name], len(each))
+        for each in recordings
+    }
+    incomplete = [name for name, known in numbers.items() if missing(known)]
+    if incomplete and frame_times is None:
+        raise ask(incomplete[0], numbers[incomplete[0]], fps)
+    if not incomplete or frame_times == "even":
+        return recordings, incomplete
+    placed = [  # all of them: a trace has the times of every frame, or of none
+        replace(each, arrival_ns=arrivals(numbers[each.name] or range(len(each)), fps))
+        for each in recordings
+    ]
+    return placed, incomplete
+
+
+def _flagged(
+    recordings: Iterable[Recording], truth: GroundTruth
+) -> tuple[list[Recording], list[str]]:
+    """The recordings with the dataset's flags of absence, and what is to be said of these."""
+    flagged, notes = [], []
+    for recording in recordings:
+        visible, note = read_visible(truth.files[recording.name], len(recording))
+        flagged.append(replace(recording, visible=visible))
+        notes += [f"sequence {recording.name!r}: {note}"] if note else []
+    absent = [int((~each.visible).sum()) for each in flagged if each.visible is not None]
+    if any(absent):
+        notes.insert(
+            0,
+            f"the target is said to be absent in {sum(absent):,} frames, in "
+            f"{np.count_nonzero(absent)} of {len(flagged)} sequences; --convention lasot leaves "
+            "them out",
+        )
+    return flagged, notes
+
+
 def _sequence_entries(
     names: Iterable[str],
     attributes: Mapping[str, tuple[str, ...]],
@@ -525,9 +595,3 @@ def _folder_name(kind: str, path: Path) -> str:
         return path.stem
     folder = path.resolve().parent if path.is_file() else path.resolve()
     return folder.parent.name if folder.name in _VOT_EXPERIMENTS else folder.name
-
-
-def listed(names: Sequence[str], most: int = 5) -> str:
-    """Some names, at most so many of them, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -24,7 +24,7 @@ from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.foreign import HEAD_BYTES, Foreign, foreign, foreign_columns, told_apart
 from lae_sim.datasets.numbers import read_lines, read_numbers, read_text
 from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed, shown
 from lae_sim.files import Budget, within_budget
 from lae_sim.importers.matlab import load_matlab
 from lae_sim.importers.otb import load_json, read_run
@@ -265,7 +265,7 @@ def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | 
     trackers = sorted({row["tracker"] or "" for row in rows if "tracker" in row})
     if trackers and tracker not in trackers:
         raise LaeError(
-            f"{path}: has {', '.join(trackers)}, not {tracker!r}; if it is there under another "
+            f"{path}: has {listed(trackers)}, not {shown(tracker)}; if it is there under another "
             "name, give that with --tracker"
         )
     for number, row in enumerate(rows, 2):

@@ -36,7 +36,7 @@ class Examples:
         sequences: the sequence of each lane.
         lanes: the outputs that a forecaster is fed, a lane for each replayed sequence.
         item: the latest item known at each query, int64 [P], not decreasing.
-        frame: the world frame of each query, int64 [P].
+        frame: the world frame of each query, int64 [P], or its time (see :class:`.base.Lanes`).
         truth: its ground truth, float64 [P, 4]; NaN where there is none.
         boxes: the tracker's box of that frame in the trace, offline, float64 [P, 4]; NaN where the
             trace has none.
@@ -45,7 +45,7 @@ class Examples:
     sequences: tuple[str, ...]
     lanes: Lanes
     item: Ints
-    frame: Ints
+    frame: Ints | Floats
     truth: Floats
     boxes: Floats
 
@@ -55,14 +55,15 @@ class Examples:
         pairing = pair([run.schedule for run in runs], [Fraction(0)])
         fed = histories(pairing)
         queries = pairs(pairing, fed)
-        lanes = lanes_of(runs, pairing, fed, np.full((len(runs), 2), np.inf))
+        lanes = lanes_of(runs, pairing, fed, [None] * len(runs))
         ends = np.cumsum(pairing.lengths)
-        row = (ends - pairing.lengths)[lanes.lane(queries.item)] + queries.frame
+        sequence = fed.sequence.take(lanes.lane(queries.item))
+        row = (ends - pairing.lengths)[sequence] + queries.frame
         return cls(
             tuple(run.recording.name for run in runs),
             lanes,
             queries.item,
-            queries.frame,
+            pairing.frame_times(sequence, queries.frame),
             np.concatenate([run.recording.truth for run in runs])[row],
             np.concatenate([run.recording.boxes for run in runs])[row],
         )
@@ -72,13 +73,11 @@ class Examples:
         """The examples of some replays as one."""
         starts = np.cumsum([0, *(part.lanes.offsets[-1] for part in parts)])
         offsets = [part.lanes.offsets[:-1] + start for part, start in zip(parts, starts)]
-        lanes = Lanes(
-            np.concatenate([*offsets, starts[-1:]]),
-            *(
-                np.concatenate([getattr(part.lanes, name) for part in parts])
-                for name in ("frames", "boxes", "image_sizes")
-            ),
+        frames, boxes, sizes = (
+            np.concatenate([getattr(part.lanes, name) for part in parts])
+            for name in ("frames", "boxes", "image_sizes")
         )
+        lanes = Lanes(np.concatenate([*offsets, starts[-1:]]), frames, boxes, sizes)
         return cls(
             tuple(name for part in parts for name in part.sequences),
             lanes,

@@ -142,7 +142,9 @@ def find_camera(
     from lae_sim.datasets.layouts import find_dataset
     from lae_sim.forecast.camera import Camera
 
-    found = find_dataset(dataset, None if root == "synthetic" else root, sequences)
+    found = find_dataset(
+        dataset, None if root == "synthetic" else root, sequences, frame_times="even"
+    )  # the trace knows when they came
     return Camera({sequence.name: sequence for sequence in found.sequences}, fps, lag)
 
 

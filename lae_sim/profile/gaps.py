@@ -107,7 +107,7 @@ class Start:
 
 def own_starts(sequence: ImageSequence, gaps: Sequence[int]) -> list[Start]:
     """The own jumps of a sequence: those of whose frames one has a truth."""
-    valid = _valid(sequence.truth)
+    valid = _valid(sequence)
     starts = []
     for gap in gaps:
         frames = [gap + step for step in FOLLOWED if gap + step < len(sequence)]
@@ -129,7 +129,7 @@ def sampled_starts(
         count: how many; fewer if there are not that many.
         farthest: in units of the start's ``search_side``.
     """
-    pairs = [_pairs(sequence.truth) for sequence in sequences]
+    pairs = [_pairs(sequence) for sequence in sequences]
     parts = [(distance * STRATA / farthest).astype(int) for _, _, distance in pairs]
     available = np.array([np.bincount(p[p < STRATA], minlength=STRATA) for p in parts], np.int64)
     available = available.reshape(len(pairs), STRATA)
@@ -179,16 +179,16 @@ def evenly(total: int, available: Ints) -> Ints:
     return taken
 
 
-def _valid(truth: Floats) -> Bools:
-    """Whether each truth is there and has a size, bool [T]."""
-    x, y, w, h = truth.T
+def _valid(sequence: ImageSequence) -> Bools:
+    """Whether each truth is there and has a size, and the target is visible, bool [T]."""
+    x, y, w, h = sequence.truth.T
     valid: Bools = np.isfinite(x + y + w + h) & (w > 0) & (h > 0)
-    return valid
+    return valid if sequence.visible is None else valid & sequence.visible
 
 
-def _pairs(truth: Floats) -> tuple[Ints, Ints, Floats]:
+def _pairs(sequence: ImageSequence) -> tuple[Ints, Ints, Floats]:
     """Start, gap and distance of every restart that may be sampled, [n] each."""
-    valid = _valid(truth)
+    truth, valid = sequence.truth, _valid(sequence)
     starts, gaps, distances = [], [], []
     for gap in SAMPLED_GAPS:
         start = 1 + np.flatnonzero(valid[1:-gap] & valid[1 + gap :])
@@ -336,8 +336,15 @@ class Gaps:
 
     def _live(self, start: Start, sequence: ImageSequence, read: Callable[[int], Image]) -> Live:
         first = start.name.start
-        truth = sequence.truth[first : first + start.frames[-1] + 1]
-        part = ImageSequence(str(start.name), truth, lambda frame: read(first + frame))
+        rows = slice(first, first + start.frames[-1] + 1)
+        arrived = None if sequence.arrival_ns is None else sequence.arrival_ns[rows]
+        part = ImageSequence(
+            str(start.name),
+            sequence.truth[rows],
+            lambda frame: read(first + frame),
+            visible=None if sequence.visible is None else sequence.visible[rows],
+            arrival_ns=None if arrived is None else arrived - arrived[0],
+        )
         return Live(part, **self._options)
 
     def _made(

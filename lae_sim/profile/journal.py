@@ -41,14 +41,14 @@ class Journal:
         text = json.dumps(settings, indent=2, sort_keys=True)
         if _made(folder):
             with written_whole(folder / _SETTINGS) as path:
-                path.write_text(text)
+                path.write_text(text, "utf-8")
             return
         if not resume:
             raise LaeError(
                 f"{folder} holds an unfinished profile: go on with it by --resume, or remove it"
             )
         try:
-            before = dict(json.loads((folder / _SETTINGS).read_text()))
+            before = dict(json.loads((folder / _SETTINGS).read_text("utf-8")))
         except (OSError, ValueError, TypeError, RecursionError) as error:
             raise LaeError(
                 f"{folder}: cannot be resumed, remove it to start anew: {error}"
@@ -77,10 +77,10 @@ class Journal:
         """
         path = self._folder / f"{name}.json"
         with suppress(OSError, ValueError, TypeError, RecursionError):
-            return dict(json.loads(path.read_text()))
+            return dict(json.loads(path.read_text("utf-8")))
         decision = decide()
         with written_whole(path) as temporary:
-            temporary.write_text(json.dumps(decision))
+            temporary.write_text(json.dumps(decision), "utf-8")
         return dict(decision)
 
     def finished(self, name: str) -> list[str]:
@@ -102,6 +102,11 @@ class Journal:
             read_trace(self._folder / name / _file_name(sequence)).metadata
             for sequence in self.finished(name)
         ]
+
+    def columns(self, name: str) -> frozenset[str]:
+        """The optional columns that any of a pass's recordings has."""
+        parts = [self._folder / name / _file_name(sequence) for sequence in self.finished(name)]
+        return frozenset(column for part in parts for column in read_trace(part).columns)
 
     def recordings(self, name: str) -> Iterator[Recording]:
         """The recordings of a pass, sequence by sequence, sorted by name."""

@@ -23,7 +23,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import latest, listed
 from lae_sim.engine.scheduler import Policy, Service, simulate
 from lae_sim.errors import LaeError, explained
-from lae_sim.forecast.base import AnyFactory, Forecaster, factory_for
+from lae_sim.forecast.base import AnyFactory, Forecaster, Resizable, factory_for
 from lae_sim.profile.timed import Answer, TimedTracker
 from lae_sim.replay.strides import phases
 from lae_sim.trace.recording import Recording
@@ -42,7 +42,7 @@ class LiveRun:
             are another device's.
         cpu_ns: CPU time of all calls together, ns.
         lost: processed frames where the tracker found nothing, int64 [k].
-        image_size: width and height, pixels.
+        image_sizes: width and height of the image of each, pixels, int64 [n, 2].
     """
 
     recording: Recording
@@ -50,7 +50,7 @@ class LiveRun:
     measured_ns: Ints
     cpu_ns: int
     lost: Ints
-    image_size: tuple[int, int]
+    image_sizes: Ints
 
 
 def run_real_time(
@@ -65,15 +65,15 @@ def run_real_time(
     Args:
         sequence: frames, and the truth, whose first box initialises the tracker.
         tracker: a tracker with a stopwatch.
-        clock: the world's clock.
+        clock: the world's clock; the sequence's own arrival times count, where it has some.
         policy: which frame is next.
         options: see :class:`Live`.
 
     Raises:
         LaeError: if the first box or a frame cannot be used, or the tracker fails.
     """
-    live = Live(sequence, tracker, **options)
-    schedule = simulate(len(sequence), clock, live, policy)
+    live = Live(sequence, tracker, clock=clock, **options)
+    schedule = simulate(len(sequence), live.clock, live, policy)
     return live.result(schedule.frames)
 
 
@@ -105,8 +105,9 @@ def run_every_frame(
         simulate(length, Clock.at(Fraction(1)), instantly, listed(frames.tolist()))
         runs.append(live.result(frames))
     whole, measured = runs[-1], np.zeros(length, np.int64)
+    sizes = np.zeros((length, 2), np.int64)
     for run in reversed(runs):  # of the phases that hold a frame, the first stands
-        measured[run.frames] = run.measured_ns
+        measured[run.frames], sizes[run.frames] = run.measured_ns, run.image_sizes
         for name in ("boxes", "elapsed_ns", "score"):
             getattr(whole.recording, name)[run.frames] = getattr(run.recording, name)[run.frames]
     return replace(
@@ -115,7 +116,11 @@ def run_every_frame(
         measured_ns=measured,
         cpu_ns=sum(run.cpu_ns for run in runs),
         lost=np.unique(np.concatenate([run.lost for run in runs])),
+        image_sizes=sizes,
     )
+
+
+_EVEN = Clock.at(Fraction(1))
 
 
 class Live:
@@ -131,6 +136,7 @@ class Live:
         include_decode: bool = False,
         forecaster_ns: int | None = 0,
         progress: Callable[[int], object] = lambda frames: None,
+        clock: Clock = _EVEN,
     ) -> None:
         """Check that the tracker can start.
 
@@ -145,6 +151,8 @@ class Live:
             include_decode: count the decoding of a frame as part of its processing.
             forecaster_ns: what the pre-forecaster adds to a frame's time, ns; None to measure it.
             progress: told how many more world frames are done, after each processed one.
+            clock: the world's, by which a pre-forecaster counts time where frames have arrival
+                times; of frames that arrive evenly it counts the numbers.
 
         Raises:
             LaeError: if the sequence has no first box, or the tracker's search cannot be set.
@@ -157,6 +165,7 @@ class Live:
             )
         if pre_forecaster is not None and not tracker.sets_search:
             raise LaeError("a pre-forecaster needs a tracker whose search can be set: translate it")
+        self.clock = clock.with_arrivals(sequence.arrival_ns)
         self._sequence = sequence
         self._tracker = tracker
         self._pre_forecaster = pre_forecaster
@@ -169,7 +178,7 @@ class Live:
         self._forecasting_ns = 0
         self._progress = progress
         self._last = -1
-        self._size = (0, 0)
+        self._sizes: list[tuple[int, int]] = []
         self._answers: list[Answer] = []
         self._elapsed_ns: list[int] = []
 
@@ -197,25 +206,27 @@ class Live:
         if self._pre_forecaster is not None:
             with explained("the pre-forecaster"):
                 factory = factory_for(self._pre_forecaster, self._sequence)
-                self._forecaster = factory(box, self._size)
+                self._forecaster = factory(box, self._sizes[-1])
         return self._tracker.init(image, box)
 
     def _track(self, frame: int, image: Image) -> Answer:
         if self._forecaster is None:
             return self._tracker.track(image)
         with explained("the pre-forecaster"):
+            if self._sizes[-1] != self._sizes[-2] and isinstance(self._forecaster, Resizable):
+                self._forecaster.resize(self._sizes[-1])
             before = perf_counter_ns()
-            predicted = self._forecaster.predict(frame)
+            predicted = self._forecaster.predict(self.clock.frame_time(frame))
             spent = perf_counter_ns() - before
             if self._keep_size:
                 predicted = resized(predicted, self._last_box)
-            search = search_region(predicted, self._size)
+            search = search_region(predicted, self._sizes[-1])
         answer = self._tracker.track(image, search)
         if answer.box is not None:
             self._last_box = answer.box
             with explained("the pre-forecaster"):
                 before = perf_counter_ns()
-                self._forecaster.update(frame, answer.box)
+                self._forecaster.update(self.clock.frame_time(frame), answer.box)
                 spent += perf_counter_ns() - before
         self._forecasting_ns = spent if self._forecaster_ns is None else self._forecaster_ns
         return answer
@@ -223,19 +234,14 @@ class Live:
     def _check(self, frame: int, image: Image) -> None:
         checked_frame(image)
         size = image.shape[1], image.shape[0]
+        self._sizes.append(size)
         if frame == 0:
-            self._size = size
             x, y, w, h = self._sequence.truth[0]
             if x >= size[0] or y >= size[1] or x + w <= 0 or y + h <= 0:
                 raise LaeError(
                     f"the first box {_text(self._sequence.truth[0])} lies outside the "
                     f"{size[0]}x{size[1]} image"
                 )
-        elif size != self._size:
-            raise LaeError(
-                f"the image is {size[0]}x{size[1]}, and the first one "
-                f"{self._size[0]}x{self._size[1]}"
-            )
 
     def result(self, frames: Ints) -> LiveRun:
         """What was done, given the frames that were processed."""
@@ -249,12 +255,20 @@ class Live:
         elapsed[frames] = self._elapsed_ns
         scores[frames] = [np.nan if a.score is None else a.score for a in self._answers]
         return LiveRun(
-            Recording.new(self._sequence.name, self._sequence.truth, boxes, elapsed, scores),
+            Recording.new(
+                self._sequence.name,
+                self._sequence.truth,
+                boxes,
+                elapsed,
+                scores,
+                self._sequence.arrival_ns,
+                visible=self._sequence.visible,
+            ),
             frames,
             np.array([answer.elapsed_ns for answer in self._answers], np.int64),
             sum(answer.cpu_ns for answer in self._answers),
             frames[[answer.box is None for answer in self._answers]],
-            self._size,
+            np.array(self._sizes, np.int64),
         )
 
 

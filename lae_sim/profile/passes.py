@@ -21,7 +21,7 @@ from lae_sim.profile.live import Live, LiveRun
 from lae_sim.profile.timed import TimedTracker, TrackerError
 from lae_sim.replay.latency import by_frame, initialised
 from lae_sim.trace.file import Trace, read_trace, write_trace
-from lae_sim.trace.metadata import FORMAT, Metadata, version_of
+from lae_sim.trace.metadata import FORMAT, ImageSizes, Metadata, version_of
 from lae_sim.trace.recording import Recording
 
 READING_INTERVAL_S = 10.0
@@ -126,6 +126,12 @@ def parse_timing(text: str) -> tuple[str, Timing]:
             raise LaeError(
                 f"{path}: has {len(recording)} frames of sequence {sequence.name!r}, which has "
                 f"{len(sequence)} here"
+            )
+        theirs, own = recording.arrival_ns, sequence.arrival_ns  # none says nothing of it
+        if theirs is not None and (own is None or not np.array_equal(theirs, own)):
+            raise LaeError(
+                f"{path}: the frames of sequence {sequence.name!r} arrived at other times than "
+                "they do here (--frame-times)"
             )
         return source(recording)
 
@@ -291,7 +297,8 @@ def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> boo
     recordings: Iterable[Recording] = journal.recordings(task.name)
     if task.metadata.kind == "restarts":  # "a b" before "a", but "a@1+3" before "a b@1+3"
         recordings = sorted(recordings, key=lambda recording: recording.name)
-    write_trace(Trace(Metadata.of(document), recordings), task.path)
+    columns = journal.columns(task.name)
+    write_trace(Trace(Metadata.of(document), recordings, columns=columns), task.path)
     return True
 
 
@@ -342,7 +349,7 @@ def _of_sequence(
     attributes = () if metadata.kind == "restarts" else sequence.attributes
     document["sequences"] = {
         run.recording.name: {
-            "image_size": list(run.image_size),
+            **ImageSizes.of(run.frames.tolist(), run.image_sizes.tolist()).entry(),
             **({"attributes": list(attributes)} if attributes else {}),
             "order": order,
             "lost": len(run.lost),

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
+from lae_sim.datasets.dropped import check_frame_times
 from lae_sim.datasets.frames import Dataset, ImageSequence
 from lae_sim.datasets.layouts import find_dataset
 from lae_sim.engine.clock import (
@@ -54,6 +55,7 @@ from lae_sim.replay.latency import time_label
 from lae_sim.replay.strides import phases
 from lae_sim.replay.world import flag, named, parse_policy, several, text
 from lae_sim.trace.file import check_replaces, read_trace
+from lae_sim.trace.metadata import text_fault
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -75,7 +77,7 @@ class ProfilePlan:
         threads: that the tracker's libraries may use; None leaves them as they are.
         frame_timeout: what a call may take before its sequence is given up, ns.
         warmup: calls before anything is measured.
-        dataset, root, sequences, box, fps: the frames (see
+        dataset, root, sequences, box, fps, frame_times: the frames (see
             :func:`lae_sim.datasets.layouts.find_dataset`).
         mode: ``"every-frame"``, or ``"real-time"`` to skip frames while the tracker is busy; by
             default real-time with a ``policy`` or a ``timing``, otherwise every frame.
@@ -111,6 +113,7 @@ class ProfilePlan:
     sequences: Sequence[str] | None = None
     box: Sequence[float] | None = None
     fps: Fraction | None = None
+    frame_times: str | None = None
     mode: str | None = None
     policy: str | None = None
     pre_forecaster: str | None = None
@@ -283,7 +286,9 @@ def run_profile(
     Raises:
         LaeError: as :func:`profile_tracker`.
     """
-    dataset = find_dataset(plan.dataset, plan.root, plan.sequences, plan.box, plan.fps)
+    dataset = find_dataset(
+        plan.dataset, plan.root, plan.sequences, plan.box, plan.fps, plan.frame_times
+    )
     path = _trace_path(out, f"{plan.tracker}-{dataset.name}")
     check_folders([str(path)])
     unfinished = path.with_suffix(".unfinished")
@@ -294,8 +299,11 @@ def run_profile(
             "remove it to profile anew"
         )
         return Profile((), ())
-    for note in dataset.notes:
-        notice(f"note: {note}")
+    for sequence in dataset.sequences:
+        if fault := text_fault(sequence.name):
+            raise LaeError(f"sequence {sequence.name!r}: the name {fault}: rename it")
+    for said in dataset.notes:
+        notice(said)
     failures: dict[str, list[Failure]] = {}
     interrupted = False
     with closing(_start(plan, notice)) as started:
@@ -340,6 +348,12 @@ def run_profile(
         raise KeyboardInterrupt
     if not written:
         raise LaeError("no sequence could be profiled")
+    resized = read_trace(written[0].path).metadata.resized
+    if resized:
+        notice(
+            f"note: the images of {len(resized)} sequences change size, such as those of "
+            f"{resized[0]!r}: the trace says from which frame on"
+        )
     return Profile(tuple(summary(task.path) for task in written), failed)
 
 
@@ -415,6 +429,7 @@ _PARSERS: Mapping[str, Callable[[Any], Any]] = {
     "sequences": sequence_names,
     "box": _box,
     "fps": parse_fps,
+    "frame_times": check_frame_times,
     "mode": text,
     "policy": _policy,
     "pre_forecaster": text,
@@ -463,7 +478,10 @@ def _passes(
         " and the decoding of frames" if plan.include_decode else "; frames decoded before"
     )
     document = base_document(plan.tracker, tracker, dataset.name, clock, plan.warmup, includes)
+    if dataset.frame_times:  # numbers are missing
+        document["dataset"]["frame_times"] = dataset.frame_times
     live: dict[str, Any] = {"tracker": tracker, "include_decode": plan.include_decode}
+    live["clock"] = clock
     if plan.pre_forecaster is not None:
         cost = plan.pre_forecaster_cost
         camera = Camera({}, dataset.fps)  # a live sequence brings its frames
@@ -495,7 +513,7 @@ def _passes(
         def run(sequence: ImageSequence, progress: Progress) -> LiveRun:
             service = times(sequence) if times else None
             return run_real_time(
-                sequence, clock=clock, policy=policy, service=service, progress=progress, **live
+                sequence, policy=policy, service=service, progress=progress, **live
             )
 
         return new_pass(name, run, kind="real-time", policy=policy_name, source=source)

@@ -225,7 +225,8 @@ class Worker(_Asked):
             os.truncate(log, 0)
             os.lseek(log, 0, os.SEEK_SET)  # the process's own offset too
             self._output = (self._output + text)[-LAST_WORDS:]
-            tell(text.decode(errors="replace"), end="")
+            # its own program, which may colour and count as it likes
+            tell(text.decode(errors="replace"), end="", keep="\n\r\t\x1b")
 
     def _kill(self) -> int:
         """End the process and all of its group, if there is one; its exit status."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -243,7 +243,7 @@ def _distance(recording: Recording, gap: int) -> float:
 
 
 def _restarted(trace: Trace) -> Iterator[tuple[RestartName, Recording]]:
-    """The restarts of a gap pass, each with its recording."""
+    """The restarts of a gap pass, each with its recording: no truth where the target is absent."""
     if trace.metadata.kind != "restarts":
         raise LaeError(
             f"a trace of kind {trace.metadata.kind} has no restarts: "
@@ -260,4 +260,7 @@ def _restarted(trace: Trace) -> Iterator[tuple[RestartName, Recording]]:
                 f"restart {recording.name!r}: a frame before {name.gap} was processed, so that was "
                 "not the gap"
             )
+        if recording.visible is not None:
+            seen = np.where(recording.visible[:, None], recording.truth, np.nan)
+            recording = replace(recording, truth=seen)
         yield name, recording

@@ -17,12 +17,12 @@ from lae_sim.engine.policies import latest
 from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
 from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError, explained, shown
-from lae_sim.forecast.base import ImageSize
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
 from lae_sim.replay.passes import split_passes
 from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
+from lae_sim.trace.metadata import ImageSizes
 from lae_sim.trace.recording import Recording, batched
 
 _GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
@@ -82,13 +82,14 @@ def replay_sequence(
     stride: Fraction = Fraction(1),
     strided: Mapping[Fraction, Recording] | None = None,
     search: SearchModel | None = None,
-    image_size: ImageSize = None,
+    image_size: tuple[int, int] | ImageSizes | None = None,
 ) -> Run:
     """Replay a recording under a latency source and a policy.
 
     Args:
         recording: the boxes and the truth.
-        clock: the world's frame rate.
+        clock: the world's frame rate. Where the recording says when its frames arrived, they arrive
+            then, and the rate is the nominal one.
         source: how to take processing times from a recording.
         policy: which frame is processed next.
         times: the same sequence recorded on another device, to take the times from.
@@ -96,11 +97,12 @@ def replay_sequence(
         strided: recordings of every frame at other strides. The boxes are taken from the pass whose
             stride is nearest to the mean number of frames from one output to the next.
         search: the model of where the tracker finds its target; None for none.
-        image_size: width and height in pixels, if known, for the model's pre-forecaster.
+        image_size: width and height in pixels, if known, for the model's pre-forecaster; or all of
+            them, where images change size.
 
     Raises:
         LaeError: if a frame is asked for that the recording lacks, or the recordings differ in
-            length; it names the sequence and the frame.
+            length or in when frames arrived; it names the sequence and the frame.
 
     Example:
         >>> import lae_sim
@@ -115,8 +117,10 @@ def replay_sequence(
     if not isinstance(clock, Clock):
         raise LaeError(f"clock: such as Clock.at(trace.metadata.fps), not {shown(clock)}")
     times = recording if times is None else times
-    job = _Job(recording, times, strided or {}, stride, search, image_size)
-    return job.run(simulate(len(recording), clock, source(job.times), policy))
+    if isinstance(image_size, tuple):
+        image_size = ImageSizes.constant(image_size)
+    job = _Job(recording, times, strided or {}, clock, stride, search, image_size)
+    return job.run(simulate(len(recording), job.clock, source(job.times), policy))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +130,10 @@ class _Job:
     recording: Recording
     times: Recording
     passes: Mapping[Fraction, Recording]
+    nominal: Clock
     stride: Fraction
     search: SearchModel | None = None
-    image_size: ImageSize = None
+    image_sizes: ImageSizes | None = None
 
     def __post_init__(self) -> None:
         for other in (self.times, *self.passes.values()):
@@ -137,6 +142,20 @@ class _Job:
                     f"sequence {self.recording.name!r} has {len(self.recording)} frames in one "
                     f"trace and {len(other)} in another"
                 )
+            theirs, own = other.arrival_ns, self.recording.arrival_ns  # none says nothing of it
+            if theirs is not None and (own is None or not np.array_equal(theirs, own)):
+                raise LaeError(
+                    f"sequence {self.recording.name!r}: its frames arrived at other times in one "
+                    "trace than in another: --forget-arrivals (forget_arrivals) spaces them evenly"
+                )
+
+    @cached_property
+    def clock(self) -> Clock:
+        """That of the sequence, which knows when its frames arrive."""
+        try:
+            return self.nominal.with_arrivals(self.recording.arrival_ns)
+        except LaeError as error:
+            raise LaeError(f"sequence {self.recording.name!r}: {error}") from error
 
     def __len__(self) -> int:
         return len(self.recording)
@@ -166,7 +185,10 @@ class _Job:
         if self.passes:
             for other, weight in _beside(strides, frames).items():
                 recorded += phase_answers(other, passes[other], frames, weight)
-        modelled = self.search.outcomes(self.recording, frames, recorded, self.image_size)
+        sizes, times = self.image_sizes, None
+        if not self.clock.is_even:
+            times = [self.clock.frame_time(frame) for frame in frames.tolist()]
+        modelled = self.search.outcomes(self.recording, frames, recorded, sizes, times)
         return replace(run, modelled=modelled)
 
     @cached_property
@@ -229,7 +251,8 @@ class Runs:
 
     Attributes:
         trace: the boxes and the truth.
-        clock: the world's.
+        clock: the world's; that of a sequence whose frames arrived at times of their own is of the
+            same, then nominal, rate.
         source: how to take processing times from a recording.
         policy: which frame is processed next.
         timing: another device's trace to take the times from; it must have the same sequences.
@@ -238,11 +261,13 @@ class Runs:
         batch: schedule many sequences at once where source and policy allow it (see
             :func:`lae_sim.engine.lanes.batchable`). The runs are the same, and come in groups.
         search: the model of where the tracker finds its target; None for none.
+        forget_arrivals: let all frames arrive evenly, whatever the traces say of it.
 
     Raises:
         LaeError: if two passes have the same stride or one is a real-time trace, or the trace or
-            that of the times is a gap pass; while one goes through the runs, if a sequence or frame
-            that is asked for is not there, or policy or source raise something.
+            that of the times is a gap pass, or it says when its frames arrived and the clock is of
+            another rate; while one goes through the runs, if a sequence or frame that is asked for
+            is not there, traces differ in when frames arrived, or policy or source raise something.
 
     Example:
         >>> import lae_sim
@@ -261,6 +286,7 @@ class Runs:
     passes: tuple[Trace, ...] = ()
     batch: bool = False
     search: SearchModel | None = None
+    forget_arrivals: bool = False
 
     def __post_init__(self) -> None:
         if self.trace.metadata.kind == "restarts":
@@ -276,6 +302,23 @@ class Runs:
         strides = [trace.metadata.stride for trace in (self.trace, *self.strided)]
         if self.strided and len(set(strides)) != len(strides):
             raise LaeError("two of the passes have the same stride: give each stride once")
+        if not self.forget_arrivals:
+            check_rate(self.trace, self.clock.fps)
+
+    @property
+    def arrivals(self) -> str | None:
+        """Whether the trace's arrival times are ``"recorded"`` or ``"forgotten"``; None without."""
+        if not self.trace.has_arrivals:
+            return None
+        return "forgotten" if self.forget_arrivals else "recorded"
+
+    def notes(self) -> list[str]:
+        """A note on when frames arrive, if the trace says so."""
+        if self.arrivals is None:
+            return []
+        if self.forget_arrivals:
+            return ["the trace's arrival times are forgotten: frames arrive evenly"]
+        return ["frames arrive when the trace says that they did, not evenly"]
 
     @property
     def strided(self) -> tuple[Trace, ...]:
@@ -294,13 +337,50 @@ class Runs:
 
     def __iter__(self) -> Iterator[Run]:
         frames = _GROUP_FRAMES if self.batch else 1
-        for jobs in batched(_jobs(self.trace, self.timing, self.strided, self.search), frames):
+        for jobs in batched(self._jobs(), frames):
             with explained("latency"):
                 services = [self.source(job.times) for job in jobs]
-            yield from _replayed(jobs, self.clock, services, self.policy)
+            yield from _replayed(jobs, services, self.policy)
+
+    def _jobs(self) -> Iterator[_Job]:
+        """Each recording of the trace with those of the same name in the other traces."""
+        forget = self.forget_arrivals
+        times = None
+        if self.timing is not None:
+            times = _finder(self.timing, "the trace of the times", forget)
+        passes = {
+            other.metadata.stride: _finder(
+                other, f"the pass of stride {other.metadata.stride}", forget
+            )
+            for other in self.strided
+        }
+        for recording in _recordings(self.trace, forget):
+            yield _Job(
+                recording,
+                recording if times is None else times(recording.name),
+                {other: find(recording.name) for other, find in passes.items()},
+                self.clock,
+                self.trace.metadata.stride,
+                self.search,
+                self.trace.metadata.image_sizes(recording.name),
+            )
 
     def __repr__(self) -> str:
         return f"<Runs of {self.trace!r} at {self.clock.fps} fps>"
+
+
+def check_rate(trace: Trace, fps: Fraction) -> None:
+    """Check that a trace can be replayed at a frame rate.
+
+    Raises:
+        LaeError: if it says when each frame arrived, and is of another rate.
+    """
+    if trace.has_arrivals and fps != trace.metadata.fps:
+        raise LaeError(
+            f"the trace says when each of its frames arrived, at a nominal {trace.metadata.fps} "
+            f"frames/s: for {fps} frames/s forget the arrivals, and space the frames evenly: "
+            "--forget-arrivals (forget_arrivals = true)"
+        )
 
 
 def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[int, Run]]:
@@ -323,7 +403,7 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
     source = runs.source
     if not isinstance(source, RandomSource):
         raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
-    for jobs in batched(_jobs(runs.trace, runs.timing, runs.strided, runs.search), _GROUP_FRAMES):
+    for jobs in batched(runs._jobs(), _GROUP_FRAMES):
         size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
         for begin in range(first, first + count, size):
             some = range(begin, min(begin + size, first + count))
@@ -333,44 +413,29 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
                 for k in range(len(some))
                 for job, rows in zip(jobs, drawn)
             ]
-            replayed = _replayed(jobs * len(some), runs.clock, times, runs.policy)
+            replayed = _replayed(jobs * len(some), times, runs.policy)
             yield from ((r, next(replayed)) for r in some for _ in jobs)
 
 
-def _replayed(
-    jobs: Sequence[_Job], clock: Clock, services: Sequence[Service], policy: Policy
-) -> Iterator[Run]:
-    schedules = simulate_lanes([len(job) for job in jobs], clock, services, policy)
+def _replayed(jobs: Sequence[_Job], services: Sequence[Service], policy: Policy) -> Iterator[Run]:
+    clocks = [job.clock for job in jobs]
+    schedules = simulate_lanes([len(job) for job in jobs], clocks, services, policy)
     for job in jobs:
         with explained(f"sequence {job.recording.name!r}: policy or latency"):
             schedule = next(schedules)
         yield job.run(schedule)
 
 
-def _jobs(
-    trace: Trace, timing: Trace | None, strided: Sequence[Trace], search: SearchModel | None
-) -> Iterator[_Job]:
-    """Each recording of a trace with those of the same name in other traces."""
-    times = None if timing is None else _finder(timing, "the trace of the times")
-    passes = {
-        other.metadata.stride: _finder(other, f"the pass of stride {other.metadata.stride}")
-        for other in strided
-    }
-    stride = trace.metadata.stride
+def _recordings(trace: Trace, forget_arrivals: bool) -> Iterator[Recording]:
+    """The recordings of a trace, perhaps as if their frames had arrived evenly."""
     for recording in trace:
-        yield _Job(
-            recording,
-            recording if times is None else times(recording.name),
-            {other: find(recording.name) for other, find in passes.items()},
-            stride,
-            search,
-            trace.metadata.image_size(recording.name),
-        )
+        forget = forget_arrivals and recording.arrival_ns is not None
+        yield replace(recording, arrival_ns=None) if forget else recording
 
 
-def _finder(trace: Trace, what: str) -> Callable[[str], Recording]:
+def _finder(trace: Trace, what: str, forget_arrivals: bool) -> Callable[[str], Recording]:
     """Finds recordings by names that are asked for in the order of the trace, sorted."""
-    recordings = iter(trace)
+    recordings = _recordings(trace, forget_arrivals)
 
     def find(name: str) -> Recording:
         for recording in recordings:

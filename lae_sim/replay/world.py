@@ -82,6 +82,8 @@ class World:
 
     Attributes:
         fps: frames that the world shows per second; each trace's own if None.
+        forget_arrivals: let frames arrive evenly also where a trace says when each of them arrived,
+            which is needed for another rate.
         policy: which frame a free tracker takes: a name (see :func:`parse_policy`), or a policy.
         latency: where processing times come from: a name (see :func:`parse_latency`), or a source.
         scale: exact factor on all times.
@@ -124,6 +126,7 @@ class World:
     convention: str = "pysot"
     forecasters: tuple[str, ...] = ("hold",)
     costs: tuple[str, ...] = ()
+    forget_arrivals: bool = False
 
     def __post_init__(self) -> None:
         for name in ("passes", "sigmas", "forecasters", "costs"):
@@ -141,6 +144,7 @@ class World:
         _check_kinds("timing and passes", traces, _TRACE, _A_TRACE)
         named("search", parse_search, named("search", text, self.search))
         named("keep_size", flag, self.keep_size)
+        named("forget_arrivals", flag, self.forget_arrivals)
         if self.pre_forecaster is not None:
             named("pre_forecaster", text, self.pre_forecaster)
             if self.search == "off":
@@ -185,6 +189,7 @@ class World:
         convention: str = "pysot",
         forecasters: str | Iterable[str] = ("hold",),
         costs: str | Iterable[str] = (),
+        forget_arrivals: bool = False,
     ) -> World:
         """A world from text and plain numbers, as command lines and files have them.
 
@@ -208,6 +213,7 @@ class World:
             convention=convention,
             forecasters=tuple(dict.fromkeys(several(forecasters))),
             costs=several(costs),
+            forget_arrivals=forget_arrivals,
         )
 
     @classmethod
@@ -324,6 +330,7 @@ class World:
             (*(each if names is None else each.chosen(names) for each in strided), *gaps),
             batch,
             find_search(self.search, opened.metadata, gaps, pre_forecaster, self.keep_size),
+            self.forget_arrivals,
         )
 
 
@@ -338,12 +345,13 @@ def replay_trace(
     passes: TraceLike | Iterable[TraceLike] = (),
     search: str = "trace",
     batch: bool = False,
+    forget_arrivals: bool = False,
 ) -> Runs:
     """Replay every sequence of a trace, one after another.
 
     Args:
         trace: the boxes and the truth: an open trace, or the path or URL of one.
-        fps, policy, latency, scale, timing, passes, search: see :meth:`World.of`.
+        fps, policy, latency, scale, timing, passes, search, forget_arrivals: see :meth:`World.of`.
         batch: see :meth:`World.replay`.
 
     Returns:
@@ -366,6 +374,7 @@ def replay_trace(
         latency=latency,
         scale=scale,
         search=search,
+        forget_arrivals=forget_arrivals,
         **open_others(timing, passes),
     )
     return world.replay(opened, batch=batch)

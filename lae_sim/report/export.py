@@ -176,7 +176,8 @@ def _parquet(path: str, schema: Any) -> Iterator[Callable[..., None]]:
 
     with (
         written_whole(path) as temporary,
-        pq.ParquetWriter(temporary, schema, compression="zstd") as writer,
+        pa.OSFile(os.fsencode(temporary), "wb") as sink,
+        pq.ParquetWriter(sink, schema, compression="zstd") as writer,
     ):
         pending: list[Any] = []
 

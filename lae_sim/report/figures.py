@@ -266,14 +266,16 @@ def timeline_figure(
     for frame in range(first, end):
         taken = frame in processed
         colour = BLUE if taken else VERMILION
-        axes.plot(frame * frame_ms, 2, "o", color=colour, fillstyle="full" if taken else "none")
-        axes.annotate(str(frame), (frame * frame_ms, 2.18), ha="center", fontsize=7)
+        arrival_ms = clock.arrival_ms(frame)
+        axes.plot(arrival_ms, 2, "o", color=colour, fillstyle="full" if taken else "none")
+        axes.annotate(str(frame), (arrival_ms, 2.18), ha="center", fontsize=7)
     ticks_per_ms = clock.ticks_per_ns * 1e6
+    left, right = clock.arrival_ms(first) - frame_ms / 2, clock.arrival_ms(end) + frame_ms / 2
     for frame, start, ready in zip(schedule.frames, schedule.start, schedule.ready):
-        if ready >= first * clock.frame_ticks and frame < end:
+        if ready >= clock.arrival(first) and frame < end:
             begin, length = start / ticks_per_ms, (ready - start) / ticks_per_ms
             axes.barh(1, length, left=begin, height=0.42, color=BLUE, edgecolor="white")
-            if begin + length / 2 < (end + 0.5) * frame_ms:
+            if begin + length / 2 < right:
                 axes.text(begin + length / 2, 1, str(frame), ha="center", va="center", color="w")
     known = pairing or pair([schedule], [sigma])
     _draw_queries(axes, run, sigma, known, first, end)
@@ -281,7 +283,7 @@ def timeline_figure(
         [2, 1, 0], ["world frame\n(hollow: skipped)", "tracker busy", "query and source"]
     )
     axes.set(ylim=(-0.6, 2.5), xlabel="time (ms)", title=f"{run.recording.name}: who answers what")
-    axes.set_xlim((first - 0.5) * frame_ms, (end + 0.5) * frame_ms)
+    axes.set_xlim(left, right)
     return figure
 
 
@@ -294,7 +296,7 @@ def _draw_queries(
     spans = zip(schedule.frames, schedule.ready, pairing.first[:, 0], pairing.end[:, 0])
     for source, ready, begin, stop in spans:
         for frame in range(max(begin, first), min(stop, end)):
-            query = clock.milliseconds(frame + sigma)
+            query = clock.arrival_ms(frame, sigma)
             axes.plot(query, 0, "|", color="black", markersize=12)
             axes.annotate(f"{source}", (query, -0.4), ha="center", fontsize=7)
             if source:

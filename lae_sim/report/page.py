@@ -16,12 +16,13 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
+from lae_sim.errors import visible
 from lae_sim.evaluation.metrics import CONVENTIONS, Convention
 from lae_sim.files import written_whole
 from lae_sim.report import study_figures, study_tables
 from lae_sim.report.study_figures import SWEEPS, Picture
 from lae_sim.report.study_view import View
-from lae_sim.report.table import COUNT, PERCENT, Column, Number, Table, printable
+from lae_sim.report.table import COUNT, PERCENT, Column, Number, Table
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
@@ -93,12 +94,12 @@ def write_report(results: StudyResults | View, path: str | os.PathLike[str]) -> 
         ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
         ...     )
         ...     lae_sim.write_report(results, f"{folder}/page.html")
-        ...     print(pathlib.Path(folder, "page.html").read_text().split()[0])
+        ...     print(pathlib.Path(folder, "page.html").read_text("utf-8").split()[0])
         <!DOCTYPE
     """
     with written_whole(path) as temporary:
         view = results if isinstance(results, View) else View(results)
-        temporary.write_text(page(view), "utf-8")
+        temporary.write_text(page(view), "utf-8", "backslashreplace")
 
 
 def page(view: View) -> str:
@@ -113,11 +114,11 @@ def page(view: View) -> str:
         undefined=StrictUndefined,
     )
     environment.filters |= {
-        "printable": printable,
+        "visible": visible,
         "base64": lambda data: base64.b64encode(data).decode(),
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),
     }
-    datasets = dict.fromkeys(printable(row.dataset) for row in view.results.summary)
+    datasets = dict.fromkeys(visible(row.dataset) for row in view.results.summary)
     return environment.get_template("page.html").render(
         title=f"Latency-aware study: {', '.join(datasets)}",
         facts=_facts(view),
@@ -216,7 +217,8 @@ def _drawn(*pictures: Picture | None) -> list[Picture]:
 
 
 def _json(document: Any) -> str:
-    return json.dumps(document, indent=1, sort_keys=True, ensure_ascii=False)
+    text = json.dumps(document, indent=1, sort_keys=True, ensure_ascii=False)
+    return visible(text, keep="\n")
 
 
 def _times(results: StudyResults) -> Table:
@@ -265,7 +267,7 @@ def _provenance(trace: Mapping[str, Any], digest: str) -> Entry:
         for stall in stalls[:STALLS]
     ]
     texts += [f"{len(stalls) - STALLS:,} more stalls"] if len(stalls) > STALLS else []
-    name = printable(trace["trace"])
+    name = visible(trace["trace"])
     return Entry(name, _json(trace["provenance"]), trace["warnings"], texts)
 
 
@@ -276,8 +278,11 @@ def convention_in_words(convention: Convention) -> str:
         "positive": "x, y, width and height are > 0",
         "finite": "it has no NaN",
     }[convention.valid]
+    if convention.by_visible:
+        valid += " and the target is not said to be absent"
+    divided = ", but are divided by" if convention.of_all else ""
     invalid = (
-        "frames without leave both metrics"
+        f"frames without leave both metrics{divided}"
         if convention.leaves_out
         else "others are misses of AUC, "
         + (

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.errors import visible
 from lae_sim.replay.reach import (
     LAPSE,
     LEAST_RESTARTS,
@@ -22,7 +23,7 @@ from lae_sim.replay.reach import (
     restarts_of,
 )
 from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, styled
-from lae_sim.report.table import COUNT, PERCENT, Cell, Column, Table, printable, text_of
+from lae_sim.report.table import COUNT, PERCENT, Cell, Column, Table, text_of
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Search
 
@@ -157,7 +158,7 @@ class ReachReport:
                 f"so at {end} {bound:.2f}"
             )
         if self.search is not None:
-            source = f" ({printable(self.search.source)})" if self.search.source else ""
+            source = f" ({visible(self.search.source)})" if self.search.source else ""
             said += f"\n             declared: up to {self.search.half_side:.3g}{source}"
         return said
 
@@ -274,7 +275,7 @@ def _draw_curve(axes: Axes, report: ReachReport) -> None:
         axes.axvline(half_side, color=VERMILION, ls="--", lw=1, label="half side declared")
     axes.set(xlabel="distance, max(|dx|, |dy|) / search side", ylabel="share of targets found")
     axes.set(xlim=(0, farthest), ylim=(-0.03, 1.03))
-    axes.set_title(printable(report.tracker))
+    axes.set_title(visible(report.tracker))
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="lower left" if _is_free(bins) else "upper right", fontsize=8)
 

@@ -90,8 +90,8 @@ def trace_report(
                 "mismatch_mean": total / frames,
                 "mismatch_max": int(staleness.mismatch_max[s]),
                 # the query is sigma frames after the frame it is for
-                "age_ms": clock.milliseconds(Fraction(total, frames) + sigma),
-                "longest_stale_ms": clock.milliseconds(int(staleness.longest_hold[s])),
+                "age_ms": clock.milliseconds(Fraction(staleness.age_sum[s]) / frames + sigma),
+                "longest_stale_ms": clock.milliseconds(Fraction(staleness.longest_stale[s])),
             }
             if by_attribute:
                 result["attributes"] = {

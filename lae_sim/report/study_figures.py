@@ -15,6 +15,7 @@ import numpy as np
 
 from lae_sim.comparison.statistics import ALL_TRACES, Interval
 from lae_sim.engine.clock import parse_duration, split_init
+from lae_sim.errors import visible
 from lae_sim.replay.search import ReachRange, parse_search
 from lae_sim.report.figures import Curve, Line, Panel, draw_curves, draw_sweep
 from lae_sim.report.study_view import SETTINGS, View, run_of, score_name, setting_of, shared_setting
@@ -32,7 +33,6 @@ from lae_sim.report.style import (
     svg_of,
     tracker_styles,
 )
-from lae_sim.report.table import printable
 from lae_sim.study.records import SummaryRow
 from lae_sim.study.summary import Scores
 
@@ -59,7 +59,7 @@ class Picture:
 
 def _short(name: object) -> str:
     """A name that fits into a picture."""
-    text = printable(name)
+    text = visible(name)
     return text if len(text) <= 36 else f"{text[:17]}…{text[-17:]}"
 
 
@@ -101,7 +101,7 @@ def curves(view: View) -> Iterator[Picture]:
         shown = [scores for scores in group if scores.setting.run in kept]
         rows = [view.row_of(scores) for scores in shown]
         yield Picture(
-            f"{printable(rows[0].dataset)}: {_recorded(rows)}{left_out}. In brackets: AUC, "
+            f"{visible(rows[0].dataset)}: {_recorded(rows)}{left_out}. In brackets: AUC, "
             "and precision at 20 px.",
             svg_of(draw_curves([curve for scores in shown for curve in _curves(view, scores)])),
         )

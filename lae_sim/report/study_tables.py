@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.comparison.statistics import ALL_TRACES
+from lae_sim.errors import visible
 from lae_sim.files import written_whole
 from lae_sim.report.study_view import (
     SETTINGS,
@@ -40,7 +41,6 @@ from lae_sim.report.table import (
     latex_of,
     legend_of,
     p_label,
-    printable,
     relative_change,
     text_of,
     write_csv,
@@ -205,7 +205,7 @@ def table2(view: View) -> Table:
             before = "offline" if forecaster == "hold" else "hold"
             return relative_change(score(record), score((tracker, before)))
 
-        group = printable(dataset)
+        group = visible(dataset)
         return [
             Column(title, score, SCORE, group=group),
             Column("Δ", change, CHANGE, group=group, name=f"{title} Δ"),
@@ -398,7 +398,7 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
             with written_whole(csv) as temporary:
                 write_csv(whole, temporary)
             with written_whole(tex) as temporary:
-                temporary.write_text(latex_of(for_paper), "utf-8")
+                temporary.write_text(latex_of(for_paper), "utf-8", "backslashreplace")
 
 
 def study_text(results: StudyResults | View) -> str:

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.comparison.statistics import by_attribute
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, shown, visible
 from lae_sim.evaluation.modelled import Ranking
-from lae_sim.report.table import printable
 from lae_sim.study.records import MEAN, Comparison, Requirement, SummaryRow
 from lae_sim.study.summary import Scores, ranked, rankings_of
 
@@ -114,7 +113,7 @@ class View:
         runs = {run_of(row): (row.dataset, row.tracker) for row in self.rows}
         alone = len({*runs.values()}) == len(runs)
         alone &= all(tracker != "unknown" for _, tracker in runs.values())
-        return {run: printable(tracker if alone else run) for run, (_, tracker) in runs.items()}
+        return {run: visible(tracker if alone else run) for run, (_, tracker) in runs.items()}
 
     @cached_property
     def forecasters(self) -> tuple[str, ...]:
@@ -138,7 +137,7 @@ class View:
                 groups.setdefault(scores.source.metadata.dataset, []).append(scores)
         for dataset, group in groups.items():
             attributes = {
-                (dataset, sequence): tuple(map(printable, s.source.metadata.attributes(sequence)))
+                (dataset, sequence): tuple(map(visible, s.source.metadata.attributes(sequence)))
                 for s in group
                 for sequence in s.sequences
             }
@@ -150,7 +149,7 @@ class View:
                     )
                 except LaeError:
                     continue  # no sequence has a score of every forecaster
-                parts.append(found.assign(dataset=printable(dataset)))
+                parts.append(found.assign(dataset=visible(dataset)))
         return pd.concat(parts, ignore_index=True) if parts else None
 
     def _tidy(self, scores: Scores) -> Iterable[dict[str, str | float]]:

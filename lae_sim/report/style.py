@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from zlib import crc32
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, visible
 from lae_sim.files import written_whole
 
 if TYPE_CHECKING:
@@ -185,6 +186,18 @@ def check_format(path: str) -> None:
         raise LaeError(f"cannot draw to {path}: name a .png, .svg or .pdf file")
 
 
+@contextmanager
+def _any_names(figure: Figure) -> Iterator[None]:
+    """Let a figure hold names in any letters, those that its font lacks as boxes."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_text(visible(text.get_text(), keep="\n"))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)
+        yield
+
+
 def save(figure: Figure, path: str) -> None:
     """Write a figure to a file whose ending says the format.
 
@@ -192,7 +205,7 @@ def save(figure: Figure, path: str) -> None:
         LaeError: if it cannot be written, or the ending is not known.
     """
     check_format(path)
-    with written_whole(path) as temporary:
+    with written_whole(path) as temporary, _any_names(figure):
         figure.savefig(temporary, format=Path(path).suffix[1:].lower(), dpi=150)
 
 
@@ -202,7 +215,6 @@ def svg_of(figure: Figure) -> bytes:
 
     file = io.BytesIO()
     settings: dict[Any, Any] = {"svg.hashsalt": "lae_sim", "svg.fonttype": "none"}
-    with matplotlib.rc_context(settings), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)
+    with matplotlib.rc_context(settings), _any_names(figure):
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
     return file.getvalue()

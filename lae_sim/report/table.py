@@ -14,6 +14,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from lae_sim.errors import visible
+from lae_sim.files import csv_cell
+
 Interval = tuple[float, float]
 
 
@@ -89,11 +92,6 @@ def relative_change(value: float | None, before: float | None) -> float | None:
     return None if value is None or not before else value / before - 1
 
 
-def printable(text: object) -> str:
-    """Text without line breaks and control characters, whatever a file holds."""
-    return "".join(c if c.isprintable() else " " for c in str(text))
-
-
 @dataclass(frozen=True)
 class Column:
     """A column: what of a record it shows, and how.
@@ -112,7 +110,7 @@ class Column:
 
     title: str
     value: str | Callable[[Any], Any]
-    form: Callable[..., str] = printable
+    form: Callable[..., str] = visible
     meaning: str = ""
     is_label: bool = False
     group: str = ""
@@ -212,6 +210,7 @@ def legend_of(table: Table) -> str:
 
 def aligned(header: Sequence[str], lines: Sequence[Sequence[str]], labels: int = 2) -> str:
     """Columns of text: the first ``labels`` to the left, the others to the right."""
+    header, lines = [*map(visible, header)], [[*map(visible, line)] for line in lines]
     widths = [max(map(len, column)) for column in zip(header, *lines)]
 
     def line(cells: Sequence[str]) -> str:
@@ -231,21 +230,25 @@ def write_csv(table: Table, path: Path) -> None:
     for column, wide in zip(table.columns, has_interval):
         title = f"{column.group} {column.name or column.title}".lstrip()
         header += [title, f"{title} low", f"{title} high"] if wide else [title]
-    with open(path, "w", newline="", encoding="utf-8") as file:
+    with open(path, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
+        writer.writerow(map(csv_cell, header))
         for row in table.rows:
             line: list[Any] = []
             for cell, wide in zip(row, has_interval):
                 line += [cell.value, *(cell.interval or (None, None))] if wide else [cell.value]
-            writer.writerow(line)
+            writer.writerow(map(csv_cell, line))
 
 
 def latex_of(table: Table) -> str:
-    """A table in LaTeX, of the package booktabs."""
+    """A table in LaTeX, of the package booktabs.
+
+    Names are written as they are, in UTF-8, which LaTeX reads by default; where they have letters
+    for which pdflatex has no font, a comment says so.
+    """
     labels, groups = table.labels, table.groups
     text = [
-        rf"% {printable(table.caption)}",
+        rf"% {visible(table.caption)}",
         r"% \usepackage{booktabs}; if it is too wide: \usepackage{adjustbox} and",
         rf"% \adjustbox{{max width=\linewidth}}{{\input{{{table.name}}}}}",
         rf"\begin{{tabular}}{{@{{}}{'l' * labels}{'r' * (len(table.columns) - labels)}@{{}}}}",
@@ -268,10 +271,19 @@ def latex_of(table: Table) -> str:
             text.append(r"\midrule")
         previous = row[0]
         text.append(" & ".join(cells) + r" \\")
+    if foreign := sorted({c for c in "".join(text) if not _has_font(c)}):
+        text.insert(1, f"% compile with lualatex or xelatex, and a font for {''.join(foreign)}")
     return "\n".join([*text, r"\bottomrule", r"\end{tabular}", ""])
 
 
+def _has_font(character: str) -> bool:
+    """Whether pdflatex can set a character: Latin 1 and 2, and some punctuation."""
+    return character < "\u0180" or "\u2013" <= character <= "\u2026"
+
+
 def _ranked(cell: Cell) -> str:
+    if cell == UNKNOWN:
+        return "--"
     marks = ("{}", r"\textbf{{{}}}", r"\underline{{{}}}")
     return marks[cell.rank].format(tex(cell.text))
 
@@ -279,14 +291,19 @@ def _ranked(cell: Cell) -> str:
 _TEX = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
     "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\char34{}",
-    "[": "{[}", "Δ": r"$\Delta$", "★": r"$\star$", **{c: "\\" + c for c in "&%$#_{}"},
+    "[": "{[}", "*": "{*}", "Δ": r"$\Delta$", "★": r"$\star$", **{c: "\\" + c for c in "&%$#_{}"},
 }  # fmt: skip
 
 
 def tex(text: str) -> str:
-    """Text for LaTeX: what is special there is escaped, and a minus is one."""
-    escaped = "".join(_TEX.get(c, c) for c in printable(text))
-    return "--" if escaped == "-" else re.sub(r"(?<![\w.-])-(?=\d)", "$-$", escaped)
+    """Text for LaTeX: what is special there is escaped, and a minus is one.
+
+    So are a star and a bracket, which the end of the line above would take for its own, and no two
+    signs melt into one, as ``--`` and ``?`` with a grave accent would.
+    """
+    escaped = "".join(_TEX.get(c, c) for c in visible(text))
+    minus = re.sub(r"(?<![\w.-])-(?=\d)", "$-$", escaped)
+    return re.sub(r"(?<=[-'`,?!])(?=[-'`,])", "{}", minus)
 
 
 METRIC_LABELS = {

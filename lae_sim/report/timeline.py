@@ -115,14 +115,14 @@ def trace_events(
     schedule = run.schedule
     if pairings is None:
         pairings = {cost: pair([schedule], [sigma], cost) for cost in {0, *costs.values()}}
-    interval, ticks_per_ns = schedule.clock.frame_ticks, schedule.clock.ticks_per_ns
-    early = max(ceil(-sigma), 0) * interval
+    clock, ticks_per_ns = schedule.clock, schedule.clock.ticks_per_ns
+    early = max(ceil(-sigma), 0) * clock.frame_ticks
     # a thread of its process's number would be its main thread, which Perfetto shows first; flows
     # are told apart over the whole file
     tracks, flows = count(1000 * process), count(process << 32)
 
     def query(frame: int) -> int:
-        return (frame * sigma.denominator + sigma.numerator) * interval // sigma.denominator
+        return clock.query(frame, sigma)
 
     def shown_ns(tick: int) -> int:
         return (tick + early) // ticks_per_ns
@@ -145,10 +145,10 @@ def trace_events(
     processed = set(schedule.frames.tolist())
     for frame in range(schedule.length):
         skipped = frame not in processed
-        tick = frame * interval
+        tick = clock.arrival(frame)
         details = {"frame": frame, "skipped": skipped, "tick": tick}
         name = f"skipped {frame}" if skipped else f"frame {frame}"
-        yield span(camera, name, tick, tick + interval, **details)
+        yield span(camera, name, tick, clock.arrival(frame + 1), **details)
     yield from named("thread", tracker, "tracker")
     start, ready = schedule.start.tolist(), schedule.ready.tolist()
     for frame, begin, end in zip(schedule.frames.tolist(), start, ready):

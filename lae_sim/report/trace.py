@@ -12,6 +12,7 @@ from itertools import pairwise
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
+from lae_sim.errors import visible
 from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
 from lae_sim.report.table import COUNT, Column, Number, Table, text_of
 from lae_sim.trace.describe import InitCost, Report, gathered
@@ -75,8 +76,7 @@ def _words(value: Any, depth: int = 0) -> str:
         return "; ".join(_words(item, depth + 1) for item in value)
     if isinstance(value, float):
         return f"{value:.6g}"
-    text = re.sub(r"\b([0-9a-f]{12})[0-9a-f]{8,}\b", r"\1...", str(value)[:300])
-    return "".join(c if c.isprintable() else "?" for c in text)
+    return visible(re.sub(r"\b([0-9a-f]{12})[0-9a-f]{8,}\b", r"\1...", str(value)[:300]))
 
 
 def _item(key: str, value: Any, depth: int) -> str:
@@ -96,6 +96,10 @@ def _frames(report: Mapping[str, Any]) -> str:
         "all processed" if processed == frames else f"{processed:,} processed",
         "all with truth" if report["with_truth"] == frames else f"{report['with_truth']:,} truths",
     ]
+    if report["longest_interval_ms"] is not None:
+        parts[0] += (
+            f", arriving at times of their own, up to {report['longest_interval_ms']:.3g} ms apart"
+        )
     sizes = [size for size in report["image_sizes"] if size != "unknown"]
     if sizes:
         parts.append(", ".join(sizes[:4]) + (" and others" if len(sizes) > 4 else "") + " px")

@@ -36,7 +36,7 @@ from lae_sim.study.spec import is_random
 from lae_sim.trace.file import Trace, held, read_trace
 from lae_sim.trace.metadata import Metadata
 
-VERSION = 5
+VERSION = 6
 """Of the cells' files; another version is another cell."""
 
 GROUP = 1 << 17
@@ -145,6 +145,7 @@ class Setting:
             "count": self.count,
             "sigmas": [str(sigma) for sigma in self.world.sigmas],
             "sequences": list(self.sequences),
+            "forget_arrivals": self.world.forget_arrivals,
         }
 
 
@@ -280,6 +281,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
             "modelled": _modelled(modelled, f, replay.search),
             "notes": [
                 *notes_on(about, trace.metadata, convention, only),
+                *replay.notes,
                 *cost_notes({cell.forecaster: cell.cost_ns} if cell.cost_ns else {}),
             ],
         }
@@ -334,12 +336,14 @@ class Replayed:
         engine: ``"batch"``, or ``"simpy"`` where the policy or the source of times knows no lanes.
         times: metadata of the trace that the times are from.
         search: the model of where the tracker finds its target; None if there is none.
+        notes: on when frames arrive.
     """
 
     runs: Iterable[tuple[int, Run]]
     engine: str
     times: Metadata
     search: SearchModel | None
+    notes: list[str]
 
 
 def replayed(setting: Setting, trace: Trace) -> Replayed:
@@ -353,8 +357,9 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
     searches = None if name is None else load_forecaster(name)
     runs = setting.world.replay(trace, batch=True, pre_forecaster=searches)
     times = runs.source(next(iter(runs.times)))
-    engine = "batch" if batchable([times], runs.policy) else "simpy"
+    in_lanes = batchable([times], runs.policy) and runs.arrivals != "recorded"
+    made: Iterable[tuple[int, Run]] = ((0, run) for run in runs)
     if isinstance(runs.source, RandomSource):
-        repeated = replay_repeated(runs, setting.count, setting.first)
-        return Replayed(repeated, engine, runs.times.metadata, runs.search)
-    return Replayed(((0, run) for run in runs), engine, runs.times.metadata, runs.search)
+        made = replay_repeated(runs, setting.count, setting.first)
+    engine = "batch" if in_lanes else "simpy"
+    return Replayed(made, engine, runs.times.metadata, runs.search, runs.notes())

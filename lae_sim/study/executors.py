@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
 from typing import Any, TypeVar
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
 from lae_sim.files import allowing
 
 AHEAD = 3
@@ -77,14 +78,16 @@ def _handed_out(
             "a worker died, for want of memory or, in a script, of 'if __name__ == \"__main__\":': "
             + _GOES_ON
         ) from error
-    except (LaeError, OSError):
+    except LaeError:
         raise
-    except Exception as error:  # whatever a cluster has to say: a worker lost too often, an import
+    except Exception as error:  # a worker lost too often, an import, a scheduler that has ended
         message = " ".join(str(error).split())[:300]
-        raise LaeError(f"a worker failed, {type(error).__name__}: {message}; {_GOES_ON}") from error
+        what = f"{type(error).__name__}: {message}".removesuffix(": ")
+        raise LaeError(f"a worker or its scheduler failed, {what}; {_GOES_ON}") from error
     finally:
-        for future in running:
-            future.cancel()
+        with suppress(Exception):  # of a cluster that is gone
+            for future in running:
+                future.cancel()
 
 
 @contextmanager
@@ -122,16 +125,27 @@ def _cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
     """An existing Dask cluster, and how many threads it has at the moment."""
     try:
         from distributed import Client
+        from distributed.comm import get_address_host_port
     except ImportError as error:
         raise LaeError(
             "--scheduler needs Dask: pip install 'lae-sim[distributed]', here and on the workers"
         ) from error
+    log = logging.getLogger("distributed.client")
+    level = log.level
+    log.setLevel(logging.CRITICAL)  # it would print the tracebacks of what is said in a line here
     try:
-        client = Client(address, timeout=5, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise LaeError(f"no Dask scheduler at {address}: {error}") from error
-    with client:
-        yield (
-            client.get_executor(pure=False, retries=2),
-            lambda: max(1, sum(client.nthreads().values())),
-        )
+        try:
+            get_address_host_port(address)  # or a client is left behind that cannot be closed
+            client = Client(address, timeout=5, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise LaeError(f"no Dask scheduler at {shown(address)}: {error}") from error
+        try:
+            yield (
+                client.get_executor(pure=False, retries=2),
+                lambda: max(1, sum(client.nthreads().values())),
+            )
+        finally:
+            with suppress(OSError, RuntimeError):  # its scheduler has ended before
+                client.close()
+    finally:
+        log.setLevel(level)

@@ -16,6 +16,7 @@ from lae_sim.forecast.costs import resolve_costs
 from lae_sim.learning.folds import Trainer
 from lae_sim.learning.registry import load_any, load_forecaster
 from lae_sim.replay.passes import passes_for
+from lae_sim.replay.run import check_rate
 from lae_sim.replay.world import World, named
 from lae_sim.study.cells import Cell, Input, Setting, Task
 from lae_sim.study.spec import Study, is_random
@@ -83,6 +84,7 @@ class Plan:
             latency=fixed,
             scale=study.scales,
             search="off",
+            forget_arrivals=study.forget_arrivals,
         )
         return fitted(read, self.forecasters, worlds, study.folds, study.seed, progress)
 
@@ -104,6 +106,11 @@ def make_plan(study: Study, base: Path | None = None) -> Plan:
     sources = {}
     for path, label in zip(paths, labels([path.removesuffix(".parquet") for path in paths])):
         trace = read_trace(path)
+        for fps in study.fps if path in own and not study.forget_arrivals else ():
+            try:
+                check_rate(trace, trace.metadata.fps if fps is None else fps)
+            except LaeError as error:
+                raise LaeError(f"fps: {path}: {error}") from error
         found = Input(path, label, digest(path), stamp(path))
         sources[path] = Source(found, trace.metadata, trace.frames or 0)
     traces, timing = [sources[path] for path in own], [sources[path] for path in timed]
@@ -173,6 +180,7 @@ def _settings(
             pre_forecaster=pre_forecaster,
             keep_size=study.keep_size and pre_forecaster is not None,
             sigmas=study.sigmas,
+            forget_arrivals=study.forget_arrivals,
         )
         setting = Setting(
             trace=source.input,
@@ -200,7 +208,8 @@ def _same_runs(source: Source, other: Source) -> bool:
 def _training(study: Study, traces: Sequence[Source]) -> str:
     """Digest of what trained forecasters depend on."""
     document = {**study.document(), "latencies": list(study.times)}
-    keys = ("latencies", "scales", "fps", "policies", "sequences", "folds", "seed")
+    keys = ("latencies", "scales", "fps", "forget_arrivals", "policies",
+            "sequences", "folds", "seed")  # fmt: skip
     values = [*(document[key] for key in keys), *(source.input.digest for source in traces)]
     return text_digest(repr(values))
 

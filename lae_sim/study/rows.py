@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -42,7 +43,11 @@ COLUMNS = {
     "mismatch_mean": "float64",
     "mismatch_max": "int32",
     "longest_hold": "int32",
+    "age_mean": "float64",
+    "age_max": "float64",
+    "longest_stale": "float64",
     "failure_frame": "int32",
+    "failure_time": "float64",
     **dict.fromkeys(METRICS, "float64"),
     **{f"offline_{metric}": "float64" for metric in METRICS},
     **{f"modelled_{name}": "float64" for name in FIGURES},
@@ -52,10 +57,12 @@ COLUMNS = {
 
 ``elapsed_ms`` is the mean time of the calls but the initialisation, ``init_ms`` the latter's;
 ``longest_hold`` and the mismatches are in frames, ``failure_frame`` is the first whose answer does
-not overlap the truth (``world_frames`` if there is none, -1 without a truth to score by); scores
-are in 0..1, NaN where the sequence leaves the mean or, offline, where the trace lacks boxes. The
-modelled ones are those under the search model, with the ends of their intervals, and ``lost_share``
-is the share of the outputs answered while the target is lost: NaN where the replay is exact, or the
+not overlap the truth (``world_frames`` if there is none, -1 without a truth to score by);
+``longest_stale``, the ages (without the permitted latency) and ``failure_time`` are the same by
+when frames arrive, in nominal frame intervals. Scores are in 0..1, NaN where the sequence leaves
+the mean or, offline, where the trace lacks boxes. The modelled ones are those under the search
+model, with the ends of their intervals, and ``lost_share`` is the share of the outputs answered
+while the target is lost: NaN where the replay is exact, or the
 model off.
 """
 
@@ -64,12 +71,11 @@ class CellRows:
     """Writes the rows of one cell, group after group, as a Parquet file in memory."""
 
     def __init__(self, sigmas: Sequence[Fraction], about: Mapping[str, str]) -> None:
-        import pyarrow as pa
         import pyarrow.parquet as pq
 
         self._sigmas = np.array([float(sigma) for sigma in sigmas])
         self._about = about
-        self._schema = pa.schema([pa.field(name, kind) for name, kind in COLUMNS.items()])
+        self._schema = _schema()
         self._file = io.BytesIO()
         texts = [name for name, kind in COLUMNS.items() if kind == "string"]
         self._writer = pq.ParquetWriter(
@@ -98,7 +104,11 @@ class CellRows:
             "mismatch_mean": (staleness.mismatch_sum / replay.frames[:, None]).ravel(),
             "mismatch_max": staleness.mismatch_max.ravel(),
             "longest_hold": staleness.longest_hold.ravel(),
+            "age_mean": (staleness.age_sum / replay.frames[:, None]).ravel(),
+            "age_max": staleness.age_max.ravel(),
+            "longest_stale": staleness.longest_stale.ravel(),
             "failure_frame": part.failure[f].ravel(),
+            "failure_time": part.failure_time[f].ravel(),
             **{metric: part.scores[metric][f].ravel() for metric in METRICS},
             **_modelled(part, f),
         }
@@ -127,6 +137,12 @@ def _modelled(part: Evaluation, f: int) -> dict[str, Floats]:
     }
 
 
+def _schema() -> Any:
+    import pyarrow as pa
+
+    return pa.schema([pa.field(name, kind) for name, kind in COLUMNS.items()])
+
+
 def read_rows(path: Path, columns: Sequence[str]) -> Any:
     """Some columns of a cell's file, as one Arrow table of one chunk.
 
@@ -137,7 +153,9 @@ def read_rows(path: Path, columns: Sequence[str]) -> Any:
     import pyarrow.parquet as pq
 
     try:
-        with pq.ParquetFile(path) as file:
+        with pa.OSFile(os.fsencode(path)) as source, pq.ParquetFile(source) as file:
+            if not file.schema_arrow.equals(_schema()):
+                raise ValueError("other columns")
             return file.read(columns).combine_chunks()
     except (pa.ArrowException, OSError, ValueError) as error:
         raise LaeError(f"{path}: damaged: delete it, and run the study again") from error

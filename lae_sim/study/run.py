@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
 from lae_sim.errors import LaeError
-from lae_sim.files import check_distinct, written_whole
+from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
 from lae_sim.study.cells import Task
@@ -214,14 +214,20 @@ def compute_study(
 
 
 def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathLike[str]]) -> None:
-    """Check that what a study writes, or takes away, is nothing that it reads.
+    """Check that what a study writes, or takes away, is nothing that it reads, and only files.
 
     Raises:
-        LaeError: if it is.
+        LaeError: if it is, or if a folder stands where a file is to be, or a file for a folder.
     """
     written = [Path(folder, f"{name}.csv") for name in ("summary", "comparisons", "required")]
     written += [Path(folder, "study.json"), Path(folder, "report.html")]
-    check_distinct([*written, *Path(folder, "tables").glob("*")], inputs)
+    tables = Path(folder, "tables")
+    for path in (*written, *tables.glob("*.csv"), *tables.glob("*.tex")):
+        if path.exists() and not path.is_file():
+            raise LaeError(f"{path}: is there already and is not a file: move it away")
+    if tables.exists() and not tables.is_dir():
+        raise LaeError(f"{tables}: is there already and is not a folder: move it away")
+    check_distinct([*written, *tables.glob("*")], inputs)
 
 
 def _run(
@@ -312,17 +318,20 @@ def _write(results: StudyResults) -> None:
         else:
             path.unlink(missing_ok=True)
     with written_whole(results.folder / "study.json") as temporary:
-        temporary.write_text(json.dumps(results.document(), allow_nan=False))
+        temporary.write_text(json.dumps(results.document(), allow_nan=False), "utf-8")
 
 
 def write_csv(records: Sequence[Record], path: Path) -> None:
     """Write records as CSV, whole or not at all; what is unknown is empty."""
     rows = flat_rows(records)
     columns = list(dict.fromkeys(chain.from_iterable(rows)))
-    with written_whole(path) as temporary, open(temporary, "w", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    with (
+        written_whole(path) as temporary,
+        open(temporary, "w", newline="", encoding="utf-8", errors="backslashreplace") as file,
+    ):
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows([csv_cell(row.get(name)) for name in columns] for row in rows)
 
 
 def flat_rows(records: Sequence[Record]) -> list[dict[str, Any]]:

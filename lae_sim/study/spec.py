@@ -53,6 +53,7 @@ class Study:
         forecasters: names, as on command lines; hold is always there.
         policies: which frame a free tracker takes.
         fps: world frame rates; None is each trace's own.
+        forget_arrivals: whether frames arrive evenly also where a trace says when each of them did.
         latencies: where times come from: ``"recorded"``, ``"by-call"``, ``"constant:47ms"``, or one
             of ``RANDOM``, which is repeated. Each may end in ``,init=TIME``.
         init: what the initialisation takes, one or several durations, each with every latency;
@@ -105,6 +106,7 @@ class Study:
     block: int = 30
     folds: int = 5
     require_auc: Fraction | None = None
+    forget_arrivals: bool = False
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -293,6 +295,7 @@ _KEYS: Mapping[str, tuple[str, Callable[[Any], Any]]] = {
     "forecasters": ("forecasters", _several(text)),
     "policies": ("policies", _several(text)),
     "fps": ("fps", _several(_rate)),
+    "forget_arrivals": ("forget_arrivals", flag),
     "latencies": ("latencies", _several(text)),
     "init": ("init", _several(_duration)),
     "scales": ("scales", _several(exact)),

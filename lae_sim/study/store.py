@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from lae_sim.errors import LaeError
-from lae_sim.files import written_whole
+from lae_sim.files import text_digest, written_whole
 from lae_sim.study.cells import Cell, Result
 
 _CELLS = "[0-9a-f]" * 32 + ".parquet"
+_BYTES, _DIGEST = "rows_bytes", "sha256"  # what the files say of themselves
 
 
 class Store:
     """The folder of a study's finished cells.
 
     ``results`` holds exactly the cells of the plan, as one Parquet dataset; ``about`` says more of
-    each; ``unused`` keeps finished cells of other plans, in case they are wanted again.
+    each; ``unused`` keeps finished cells of other plans, in case they are wanted again. What is
+    not as it was written, cut off or edited, counts as not there, and is computed again.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -67,6 +70,9 @@ class Store:
                 raise LaeError(f"{self.folder}: is not empty and not of a study: name another")
             for path in folders:
                 path.mkdir(exist_ok=True)
+            for path in (self.folder, *folders):  # before anything is computed for it
+                with tempfile.TemporaryFile(dir=path):
+                    pass
             wanted = {f"{cell.key}.parquet" for cell in cells}
             for path in self.results.glob(_CELLS):
                 if path.name not in wanted:
@@ -78,24 +84,29 @@ class Store:
             raise LaeError(f"{self.folder}: {error.strerror or error}") from error
 
     def has(self, cell: Cell) -> bool:
-        """Whether a cell is finished."""
-        return self.rows(cell).is_file() and self._details(cell.key).is_file()
+        """Whether a cell is finished, and its files are whole."""
+        about, rows = self.document(cell.key), self.rows(cell)
+        return about is not None and rows.is_file() and rows.stat().st_size == about.get(_BYTES)
 
     def put(self, result: Result) -> None:
         """Keep a result; its rows come last, and say that it is finished."""
-        self.keep(result.key, result.about)
+        self.keep(result.key, {**result.about, _BYTES: len(result.rows)})
         with written_whole(self.results / f"{result.key}.parquet") as temporary:
             temporary.write_bytes(result.rows)
 
     def document(self, key: str) -> dict[str, Any] | None:
-        """A document that was kept under a key, if it was."""
-        path = self._details(key)
-        return self._read(path) if path.is_file() else None
+        """A document that was kept under a key, if it was, and is as it was written."""
+        with suppress(OSError, ValueError, RecursionError):
+            document = json.loads(self._details(key).read_text("utf-8"))
+            if isinstance(document, dict) and document.pop(_DIGEST, None) == _digest(document):
+                return document
+        return None
 
-    def keep(self, key: str, document: Any) -> None:
-        """Keep a document under a key."""
+    def keep(self, key: str, document: Mapping[str, Any]) -> None:
+        """Keep a document under a key, with its digest."""
+        text = json.dumps({**document, _DIGEST: _digest(document)}, allow_nan=False)
         with written_whole(self._details(key)) as temporary:
-            temporary.write_text(json.dumps(document, allow_nan=False))
+            temporary.write_text(text, "utf-8")
 
     def rows(self, cell: Cell) -> Path:
         """The file of a cell's rows."""
@@ -107,14 +118,14 @@ class Store:
         Raises:
             LaeError: if its file is damaged.
         """
-        return self._read(self._details(cell.key))
-
-    def _read(self, path: Path) -> dict[str, Any]:
-        try:
-            document: dict[str, Any] = json.loads(path.read_text())
-        except (OSError, ValueError, RecursionError) as error:
-            raise LaeError(f"{path}: cannot be read: {error}; delete it") from error
+        if (document := self.document(cell.key)) is None:
+            raise LaeError(f"{self._details(cell.key)}: damaged: run the study again")
         return document
 
     def _details(self, key: str) -> Path:
         return self._about / f"{key}.json"
+
+
+def _digest(document: Mapping[str, Any]) -> str:
+    """Of all that a document holds, in its order."""
+    return text_digest(json.dumps(document, allow_nan=False))

@@ -45,11 +45,12 @@ class Scores:
         setting: the first of the settings, which differ in their repetitions.
         forecaster, convention: names.
         sequences: names, S of them.
-        means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``;
-            of ``mismatch_max`` and ``longest_hold`` the largest (frames). Where something is
+        means: per score over the repetitions, float64 [S, M] in 0..1; and of ``mismatch_mean``
+            and ``age_mean``; of ``age_max`` and ``longest_stale`` the largest. Where something is
             modelled, ``modelled_auc`` and ``modelled_dp20`` are there and below, those of exact
             replays as they are.
-        repeated: ``auc``, ``dp20`` and ``failure_frame`` at the first sigma, float64 [R, S].
+        repeated: ``auc``, ``dp20``, ``failure_frame`` and ``failure_time`` at the first sigma,
+            float64 [R, S].
         over_sigmas: ``auc`` and ``dp20`` as plain means over sigma, float64 [R, S].
         once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms``, ``init_ms``,
             ``lost_share`` and the offline scores, float64 [S].
@@ -105,9 +106,9 @@ class Scores:
         return self.over_sigmas if over_sigmas else self.repeated
 
 
-_WORST = {"mismatch_max", "longest_hold"}
-_STALENESS = ("mismatch_mean", *sorted(_WORST))
-_REPEATED = ("auc", "dp20", "failure_frame")
+_WORST = {"age_max", "longest_stale"}
+_STALENESS = ("mismatch_mean", "age_mean", *sorted(_WORST))
+_REPEATED = ("auc", "dp20", "failure_frame", "failure_time")
 _ONCE = ("world_frames", "processed", "elapsed_ms", "init_ms", "lost_share",
          *(f"offline_{m}" for m in METRICS))  # fmt: skip
 _MODELLED = tuple(f"modelled_{metric}" for metric in MODELLED)
@@ -345,20 +346,22 @@ def _staleness(scores: Scores, s: int) -> Staleness:
     """How old answers are, and how long the target is held, in world time, at one sigma."""
     sigma, clock = scores.setting.world.sigmas[s], Clock.at(scores.setting.fps)
     frames, frame_ms = scores.once["world_frames"], clock.milliseconds(1)
-    mismatch = scores.means["mismatch_mean"][:, s] * frames
-    mean = float(mismatch.sum() / frames.sum())
+    mismatch, age = (
+        float((scores.means[name][:, s] * frames).sum() / frames.sum())
+        for name in ("mismatch_mean", "age_mean")
+    )
     staleness = Staleness(
-        mismatch_mean=mean,
-        age_ms=(mean + float(sigma)) * frame_ms,
-        age_max_ms=float(scores.means["mismatch_max"][:, s].max() + sigma) * frame_ms,
-        longest_stale_ms=float(scores.means["longest_hold"][:, s].max()) * frame_ms,
+        mismatch_mean=mismatch,
+        age_ms=(age + float(sigma)) * frame_ms,
+        age_max_ms=float(scores.means["age_max"][:, s].max() + sigma) * frame_ms,
+        longest_stale_ms=float(scores.means["longest_stale"][:, s].max()) * frame_ms,
     )
     if s:
         return staleness
     failure = scores.repeated["failure_frame"]
     scored = failure >= 0
     failed = (failure < frames)[scored]
-    median = _median_survival(failure[scored], failed)
+    median = _median_survival(scores.repeated["failure_time"][scored], failed)
     return replace(
         staleness,
         failed=float(failed.mean()) if len(failed) else None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any, NoReturn
 
 import numpy as np
@@ -10,7 +9,9 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import MOST_PIXELS, iou
 from lae_sim.errors import TraceError
-from lae_sim.trace.columns import BOX, TRUTH, Rows
+from lae_sim.trace.columns import BOX, TRUTH, Nullable, Rows
+from lae_sim.trace.metadata import text_fault
+from lae_sim.trace.recording import OPTIONAL_COLUMNS
 from lae_sim.trace.restarts import is_restart
 
 COLUMN_TYPES = {
@@ -19,12 +20,13 @@ COLUMN_TYPES = {
     **dict.fromkeys(TRUTH + BOX, "double"),
     "elapsed_ns": "int64",
     "score": "float",
+    "arrival_ns": "int64",
+    "visible": "bool",
 }
-OPTIONAL = (*TRUTH, "score")
+OPTIONAL = (*TRUTH, "score", *OPTIONAL_COLUMNS)
 # No known tracker does 5,000 frames/s, so a shorter typical time is in another unit.
 _LEAST_TYPICAL_NS = 200_000
 _SAMPLE_ROWS = 10_000  # of each batch, to tell boxes from corners
-_SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 def check_schema(schema: Any, where: str) -> None:
@@ -58,7 +60,7 @@ def _type_name(arrow_type: Any) -> str:
 
 
 def _cause_of_type(name: str, actual: str) -> str:
-    if name == "elapsed_ns" and actual in ("double", "float", "halffloat"):
+    if name in ("elapsed_ns", "arrival_ns") and actual in ("double", "float", "halffloat"):
         return ": are these seconds or milliseconds? Write whole nanoseconds"
     return ""
 
@@ -78,6 +80,7 @@ class RowChecker:
         self.restarts = restarts
         self._last_name: str | None = None
         self._next_frame = 0
+        self._last_arrival_ns = 0
 
     def __call__(self, rows: Rows) -> None:
         """Check rows that follow the ones before.
@@ -88,6 +91,8 @@ class RowChecker:
         self._check_order(rows)
         self._check_nulls(rows)
         self._check_values(rows)
+        if rows.arrival_ns is not None:
+            self._check_arrivals(rows, rows.arrival_ns)
         if not self.profiled:
             self._check_units(rows)
 
@@ -101,9 +106,9 @@ class RowChecker:
     def _check_order(self, rows: Rows) -> None:
         first_frames = np.zeros(len(rows.names), np.int64)
         for run, name in enumerate(rows.names):
-            if not name or _SURROGATE.search(name):
-                problem = "the name is not Unicode text" if name else "the name is null or empty"
-                self._fail(rows, int(rows.starts[run]), "sequence", problem)
+            fault = text_fault(name) if name else "is null or empty"
+            if fault is not None:
+                self._fail(rows, int(rows.starts[run]), "sequence", f"the name {fault}")
             if self.restarts and not is_restart(name):
                 problem = "a restart is called SEQUENCE@START+GAP, such as 'car@12+6'"
                 self._fail(rows, int(rows.starts[run]), "sequence", problem)
@@ -160,20 +165,47 @@ class RowChecker:
                 if np.isfinite(value):
                     cause = "beyond any image"
                 self._fail(rows, row, columns[i], f"{value} is {cause}")
+        no_score = np.flatnonzero(~np.isfinite(rows.score) & ~rows.score_null)
+        if len(no_score):
+            row = int(no_score[0])
+            self._fail(rows, row, "score", f"{rows.score[row]}: a score is finite or null")
         negative = np.flatnonzero((rows.elapsed_ns < 0) & ~rows.elapsed_null)
         if len(negative):
             row = int(negative[0])
             self._fail(rows, row, "elapsed_ns", f"negative time {rows.elapsed_ns[row]} ns")
 
+    def _check_arrivals(self, rows: Rows, arrival_ns: Nullable) -> None:
+        times, null = arrival_ns.values, arrival_ns.null
+        if null.any():
+            problem = "null: give every frame of the trace the time when it arrived, or none"
+            self._fail(rows, int(np.argmax(null)), "arrival_ns", problem)
+        first = np.flatnonzero(rows.frame == 0)
+        late = first[times[first] != 0]
+        if len(late):
+            row = int(late[0])
+            self._fail(
+                rows, row, "arrival_ns", f"{times[row]}: times count from frame 0, which is at 0"
+            )
+        before = np.concatenate([[self._last_arrival_ns], times[:-1]])
+        wrong = np.flatnonzero((times <= before) & (rows.frame > 0))
+        if len(wrong):
+            row = int(wrong[0])
+            problem = f"{times[row]} ns, not after the frame before ({before[row]} ns)"
+            self._fail(rows, row, "arrival_ns", problem)
+        self._last_arrival_ns = int(times[-1])
+
     def _check_units(self, rows: Rows) -> None:
         times = rows.elapsed_ns[rows.elapsed_ns > 0]
         typical = float(np.median(times)) if len(times) > 1 else 0.0
         if 2 <= typical < _LEAST_TYPICAL_NS:
-            unit = "milliseconds" if typical < 1000 else "microseconds"
             row = int(np.argmax(rows.elapsed_ns > 0))
-            self._fail(
-                rows, row, "elapsed_ns", f"times look like {unit} (median {typical:g}); write ns"
-            )
+            self._fail(rows, row, "elapsed_ns", _cause_of_times(f"median {typical:g}", typical))
+        if rows.arrival_ns is not None and len(rows.frame) > 1:
+            steps = np.diff(rows.arrival_ns.values)[rows.frame[1:] > 0]
+            typical = float(np.median(steps)) if len(steps) else 0.0
+            if 1 <= typical < _LEAST_TYPICAL_NS:
+                problem = _cause_of_times(f"{typical:g} from frame to frame", typical)
+                self._fail(rows, 1, "arrival_ns", problem)
         corners = "boxes look like x1, y1, x2, y2; write x, y, w, h"
         truth, boxes = rows.truth[:_SAMPLE_ROWS], rows.boxes[:_SAMPLE_ROWS]
         starts = rows.starts[rows.starts < len(truth)]
@@ -194,6 +226,11 @@ def _cause_of_order(frame: int, expected: int) -> str:
     if frame > expected:
         return f"{frame - expected} missing from frame {expected} on; write every world frame"
     return "rows are not sorted by frame"
+
+
+def _cause_of_times(seen: str, typical: float) -> str:
+    unit = "milliseconds" if typical < 1000 else "microseconds"
+    return f"times look like {unit} ({seen}); write ns"
 
 
 def _move_like_corners(boxes: Floats, starts: Ints) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +10,29 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.trace.recording import Recording
+from lae_sim.trace.recording import OPTIONAL_COLUMNS, Recording
 
 TRUTH = ("truth_x", "truth_y", "truth_w", "truth_h")
 BOX = ("x", "y", "w", "h")
+
+
+@dataclass(frozen=True)
+class Nullable:
+    """The values of a column that a trace may lack, [n], and where they are null, bool [n]."""
+
+    values: npt.NDArray[Any]
+    null: Bools
+
+    @classmethod
+    def of_recordings(cls, name: str, recordings: Sequence[Recording]) -> Nullable:
+        """That of an optional column; null in those recordings that lack it."""
+        found = [getattr(recording, name) for recording in recordings]
+        lengths = [len(recording) for recording in recordings]
+        filled = [
+            np.ones(length, OPTIONAL_COLUMNS[name]) if values is None else values
+            for values, length in zip(found, lengths)
+        ]
+        return cls(np.concatenate(filled), np.repeat([v is None for v in found], lengths))
 
 
 @dataclass(frozen=True)
@@ -29,6 +48,9 @@ class Rows:
         elapsed_ns: int64 [n], -1 where null.
         elapsed_null: bool [n].
         score: float32 [n], NaN where null.
+        score_null: bool [n].
+        arrival_ns: int64, None without that column.
+        visible: bool, None without that column.
     """
 
     names: list[str]
@@ -41,14 +63,19 @@ class Rows:
     elapsed_ns: Ints
     elapsed_null: Bools
     score: npt.NDArray[np.float32]
+    score_null: Bools
+    arrival_ns: Nullable | None = None
+    visible: Nullable | None = None
 
     @classmethod
-    def of_recordings(cls, recordings: Sequence[Recording]) -> Rows:
-        """The rows of whole recordings."""
+    def of_recordings(cls, recordings: Sequence[Recording], columns: Iterable[str] = ()) -> Rows:
+        """The rows of whole recordings, with optional columns that they have or that are named."""
+        names = {*columns, *(name for recording in recordings for name in recording.columns)}
         lengths = [len(recording) for recording in recordings]
         truth = np.concatenate([recording.truth for recording in recordings])
         boxes = np.concatenate([recording.boxes for recording in recordings])
         elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
+        score = np.concatenate([recording.score for recording in recordings])
         return cls(
             names=[recording.name for recording in recordings],
             starts=np.cumsum([0, *lengths]),
@@ -59,7 +86,9 @@ class Rows:
             box_null=np.isnan(boxes),
             elapsed_ns=elapsed,
             elapsed_null=elapsed == -1,
-            score=np.concatenate([recording.score for recording in recordings]),
+            score=score,
+            score_null=np.isnan(score),
+            **{name: Nullable.of_recordings(name, recordings) for name in names},
         )
 
     @classmethod
@@ -75,10 +104,10 @@ class Rows:
         truth, truth_null = _boxes(column, TRUTH, len(codes))
         boxes, box_null = _boxes(column, BOX, len(codes))
         elapsed_null = is_null(column["elapsed_ns"])
-        score = np.full(len(codes), np.nan, np.float32)
+        score, score_null = np.full(len(codes), np.nan, np.float32), np.ones(len(codes), np.bool_)
         if "score" in column:
-            scored = ~is_null(column["score"])
-            score[scored] = to_numpy(column["score"], np.float32)[scored]
+            score_null = is_null(column["score"])
+            score[~score_null] = to_numpy(column["score"], np.float32)[~score_null]
         return cls(
             names=[dictionary[code] for code in codes[starts[:-1]]],
             starts=starts,
@@ -90,10 +119,13 @@ class Rows:
             elapsed_ns=np.where(elapsed_null, -1, to_numpy(column["elapsed_ns"], np.int64)),
             elapsed_null=elapsed_null,
             score=score,
+            score_null=score_null,
+            arrival_ns=_nullable(column.get("arrival_ns"), np.int64),
+            visible=_nullable(column.get("visible"), np.bool_),
         )
 
     def to_batch(self, schema: Any) -> Any:
-        """The rows as an Arrow record batch of the schema."""
+        """The rows as an Arrow record batch of the schema, which may have optional columns."""
         import pyarrow as pa
 
         codes = np.repeat(np.arange(len(self.names), dtype=np.int32), np.diff(self.starts))
@@ -104,8 +136,11 @@ class Rows:
             *(from_numpy(self.truth[:, i], ~self.truth_null[:, i]) for i in range(4)),
             *(from_numpy(self.boxes[:, i], ~self.box_null[:, i]) for i in range(4)),
             from_numpy(self.elapsed_ns, ~self.elapsed_null),
-            from_numpy(self.score, ~np.isnan(self.score)),
+            from_numpy(self.score, ~self.score_null),
         ]
+        for name in schema.names[len(columns) :]:
+            column: Nullable = getattr(self, name)
+            columns.append(from_numpy(column.values, ~column.null))
         return pa.RecordBatch.from_arrays(columns, schema=schema)
 
     def recordings(self) -> Iterator[Recording]:
@@ -113,8 +148,27 @@ class Rows:
         for name, start, end in zip(self.names, self.starts[:-1], self.starts[1:]):
             run = slice(start, end)
             yield Recording(
-                name, self.truth[run], self.boxes[run], self.elapsed_ns[run], self.score[run]
+                name,
+                self.truth[run],
+                self.boxes[run],
+                self.elapsed_ns[run],
+                self.score[run],
+                None if self.arrival_ns is None else self.arrival_ns.values[run],
+                None if self.visible is None else _flags(self.visible, run),
             )
+
+
+def _nullable(column: Any, dtype: npt.DTypeLike) -> Nullable | None:
+    return None if column is None else Nullable(to_numpy(column, dtype), is_null(column))
+
+
+def _flags(visible: Nullable, run: slice) -> Bools | None:
+    """The flags of a sequence, or None if nothing is said of any of its frames.
+
+    A frame of which nothing is said counts as one where the target is visible.
+    """
+    null = visible.null[run]
+    return None if null.all() else visible.values[run] | null
 
 
 def _boxes(column: dict[str, Any], names: tuple[str, ...], n: int) -> tuple[Floats, Bools]:
@@ -140,12 +194,14 @@ def from_numpy(values: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = N
     """An Arrow array of one-dimensional numbers; null where ``valid`` is false."""
     import pyarrow as pa
 
-    values = np.ascontiguousarray(values)
+    data = np.ascontiguousarray(values)
+    if data.dtype == np.bool_:
+        data = np.packbits(data, bitorder="little")
     bitmap = None
     if valid is not None and not valid.all():
         bitmap = pa.py_buffer(np.packbits(valid, bitorder="little").tobytes())
     arrow_type = pa.from_numpy_dtype(values.dtype)
-    return pa.Array.from_buffers(arrow_type, len(values), [bitmap, pa.py_buffer(values)])
+    return pa.Array.from_buffers(arrow_type, len(values), [bitmap, pa.py_buffer(data)])
 
 
 def from_texts(texts: Sequence[str], times: int = 1) -> Any:
@@ -165,7 +221,16 @@ def to_numpy(array: Any, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     data = array.buffers()[1]
     if data is None:
         return np.zeros(len(array), dtype)
+    if dtype is np.bool_:
+        return _bits(data, array)
     return np.frombuffer(data, dtype, len(array), array.offset * np.dtype(dtype).itemsize)
+
+
+def _bits(buffer: Any, array: Any) -> npt.NDArray[np.bool_]:
+    """The bits of an Arrow array's buffer, bool [n]."""
+    end = array.offset + len(array)
+    bits = np.unpackbits(np.frombuffer(buffer, np.uint8), count=end, bitorder="little")
+    return bits[array.offset :].astype(np.bool_)
 
 
 def is_null(array: Any) -> npt.NDArray[np.bool_]:
@@ -173,7 +238,4 @@ def is_null(array: Any) -> npt.NDArray[np.bool_]:
     bitmap = array.buffers()[0]
     if bitmap is None or not array.null_count:
         return np.zeros(len(array), np.bool_)
-    end = array.offset + len(array)
-    bits = np.unpackbits(np.frombuffer(bitmap, np.uint8), count=end, bitorder="little")
-    null: npt.NDArray[np.bool_] = bits[array.offset :] == 0
-    return null
+    return ~_bits(bitmap, array)

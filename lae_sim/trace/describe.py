@@ -274,13 +274,18 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
 
     metadata = trace.metadata
     entries = metadata.document.get("sequences", {})
+    resized = frozenset(metadata.resized)
     sequences, frames, with_truth, sizes = [], 0, 0, Counter[str]()
+    apart: list[float] = []
     for recording in trace:
         sequences.append(SequenceTimes.of(recording))
         frames += len(recording)
         with_truth += int((~np.isnan(recording.truth[:, 0])).sum())
+        if recording.arrival_ns is not None:
+            apart.append(float(np.diff(recording.arrival_ns).max(initial=0)) / 1e6)
         size = metadata.image_size(recording.name)
-        sizes[f"{size[0]}x{size[1]}" if size else "unknown"] += 1
+        changing = " (changing)" if recording.name in resized else ""
+        sizes[f"{size[0]}x{size[1]}{changing}" if size else "unknown"] += 1
     order = {s.name: entries.get(s.name, {}).get("order") for s in sequences}
     ordered = all(isinstance(place, int) for place in order.values())
     if ordered:
@@ -291,6 +296,7 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
     report = {
         "trace": path,
         "fps": str(metadata.fps),
+        "longest_interval_ms": max(apart) if apart else None,
         "provenance": {k: v for k, v in metadata.document.items() if k not in _NOT_SHOWN},
         "sequences": len(sequences),
         "world_frames": frames,

@@ -7,21 +7,22 @@ the file, and a trace is written whole or not at all. Nothing in a trace is ever
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lae_sim.errors import LaeError, TraceError, hint, shown
+from lae_sim.errors import LaeError, TraceError, hint, listed, shown
 from lae_sim.files import Budget, json_memory, sequence_names, written_whole
 from lae_sim.trace.checks import COLUMN_TYPES, RowChecker, check_schema
-from lae_sim.trace.columns import BOX, TRUTH, Rows, checksums
+from lae_sim.trace.columns import BOX, TRUTH, Nullable, Rows, checksums
 from lae_sim.trace.locate import is_url, opened
 from lae_sim.trace.metadata import Metadata
-from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
+from lae_sim.trace.recording import BATCH_ROWS, OPTIONAL_COLUMNS, Recording, batched
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -42,6 +43,9 @@ class Trace:
         metadata: what the trace says of itself.
         recordings: one per sequence.
         frames: world frames of all its sequences together, where known.
+        columns: those of :data:`~lae_sim.trace.recording.OPTIONAL_COLUMNS` that its recordings may
+            have. Only of a stream need it be given, to be written with those that its first
+            recording lacks.
 
     Example:
         >>> import lae_sim
@@ -55,6 +59,7 @@ class Trace:
     metadata: Metadata
     recordings: Iterable[Recording]
     frames: int | None = None
+    columns: frozenset[str] = frozenset()
 
     def __iter__(self) -> Iterator[Recording]:
         return iter(self.recordings)
@@ -74,6 +79,12 @@ class Trace:
         if isinstance(self.recordings, _StoredRecordings):
             return tuple(self.recordings.lengths())
         return tuple(recording.name for recording in self.recordings)
+
+    @property
+    def has_arrivals(self) -> bool:
+        """Whether it says when each frame arrived."""
+        known = self.recordings if isinstance(self.recordings, Sequence) else ()
+        return "arrival_ns" in self.columns or any(r.arrival_ns is not None for r in known)
 
     def chosen(self, sequences: str | Iterable[str]) -> Trace:
         """The trace with some of its sequences only; of a file their names alone are read.
@@ -128,9 +139,9 @@ def read_trace(path: str | os.PathLike[str], sequences: str | Iterable[str] | No
     if not isinstance(path, (str, os.PathLike)):
         raise LaeError(f"path: a trace is read from a path or a URL, not {shown(path)}")
     stored = _StoredRecordings(os.fspath(path))
-    metadata, rows = stored.describe()
+    metadata, rows, columns = stored.describe()
     stored = replace(stored, profiled=metadata.profiled, restarts=metadata.kind == "restarts")
-    trace = Trace(metadata, stored, rows)
+    trace = Trace(metadata, stored, rows, columns)
     return trace if sequences is None else trace.chosen(sequences)
 
 
@@ -174,7 +185,8 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
         path: the file, in a folder that is there.
 
     Raises:
-        TraceError: if the recordings are not sorted by name or break the format.
+        TraceError: if the recordings are not sorted by name or break the format, or one that was
+            not foreseen has a column which those before it lack (see :attr:`Trace.columns`).
         LaeError: if the file cannot be written.
 
     Example:
@@ -191,17 +203,23 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
 
     if not isinstance(trace, Trace) or not isinstance(path, (str, os.PathLike)):
         raise LaeError(f"write_trace takes a trace and a path, not {shown(trace)}, {shown(path)}")
+    groups = batched(trace)
+    first = next(groups, [])
+    columns = _columns(trace, first)
     types = {**COLUMN_TYPES, "score": "float32"}
+    kept = [name for name in types if name not in OPTIONAL_COLUMNS or name in columns]
+    metadata = trace.metadata.with_columns() if columns else trace.metadata
+    never_null = ("sequence", "frame", "arrival_ns")
     schema = pa.schema(
-        [pa.field(name, types[name], nullable=name not in ("sequence", "frame")) for name in types],
-        {"lae_sim": trace.metadata.dumps()},
+        [pa.field(name, types[name], nullable=name not in never_null) for name in kept],
+        {"lae_sim": metadata.dumps()},
     )
-    metadata = trace.metadata
     check = RowChecker(str(path), metadata.profiled, restarts=metadata.kind == "restarts")
     with (
         written_whole(path) as temporary,
+        pa.OSFile(os.fsencode(temporary), "wb") as sink,  # whose name need not be UTF-8
         pq.ParquetWriter(
-            temporary,
+            sink,
             schema,
             compression="zstd",
             compression_level=1,
@@ -210,20 +228,34 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
                 **dict.fromkeys((*TRUTH, *BOX, "score"), "BYTE_STREAM_SPLIT"),
                 "frame": "DELTA_BINARY_PACKED",
                 "elapsed_ns": "DELTA_BINARY_PACKED",
+                **({"arrival_ns": "DELTA_BINARY_PACKED"} if "arrival_ns" in columns else {}),
             },
             **checksums("write_page_checksum"),
         ) as writer,
     ):
-        group: list[Recording] = []
-        for group in batched(trace):
+        for group in chain([first], groups) if first else ():
             for recording in group:
                 if not len(recording):
                     raise TraceError(f"{path}: sequence {recording.name!r} has no frames")
-            rows = Rows.of_recordings(group)
+                if more := set(recording.columns) - columns:
+                    raise TraceError(
+                        f"{path}: sequence {recording.name!r} has {', '.join(sorted(more))}, which "
+                        "the first ones lack: name such columns when the trace is made "
+                        "(Trace(columns=...)), or give it a list of recordings"
+                    )
+            rows = Rows.of_recordings(group, columns)
             check(rows)
             writer.write_batch(rows.to_batch(schema))
-        if not group:
+        if not first:
             raise TraceError(f"{path}: the trace is empty")
+
+
+def _columns(trace: Trace, first: Sequence[Recording]) -> frozenset[str]:
+    """The optional columns of a trace that is to be written, as far as its start can tell."""
+    known = isinstance(trace.recordings, Sequence)
+    some: Iterable[Recording] = trace if known else first
+    columns = frozenset(name for recording in some for name in recording.columns)
+    return columns if known else columns | trace.columns
 
 
 def trace_at(path: str | os.PathLike[str]) -> Metadata | None:
@@ -261,8 +293,8 @@ class _StoredRecordings:
     profiled: bool = False
     restarts: bool = False
 
-    def describe(self) -> tuple[Metadata, int]:
-        """The file's metadata and its number of rows."""
+    def describe(self) -> tuple[Metadata, int, frozenset[str]]:
+        """The file's metadata, its number of rows, and the optional columns that it has."""
         with self._opened() as file:
             check_schema(file.schema_arrow, self.path)
             stored = (file.schema_arrow.metadata or {}).get(b"lae_sim")
@@ -273,7 +305,8 @@ class _StoredRecordings:
                 )
             Budget(self.path, TraceError).take(json_memory(stored))
             try:
-                return Metadata.parse(stored), file.metadata.num_rows
+                columns = frozenset(OPTIONAL_COLUMNS).intersection(file.schema_arrow.names)
+                return Metadata.parse(stored), file.metadata.num_rows, columns
             except TraceError as error:
                 raise TraceError(f"{self.path}: {error}") from error
 
@@ -393,7 +426,7 @@ class _StoredRecordings:
 def _listed(missing: Iterable[str], known: Iterable[str] = ()) -> str:
     """Sequences that are not there, with what may have been meant by one."""
     names = sorted(missing, key=str)
-    return ", ".join(map(repr, names)) + (hint(names[0], known) if len(names) == 1 else "")
+    return listed(map(repr, names)) + (hint(names[0], known) if len(names) == 1 else "")
 
 
 def _joined(parts: list[Recording]) -> Recording:
@@ -405,4 +438,9 @@ def _joined(parts: list[Recording]) -> Recording:
         np.concatenate([part.boxes for part in parts]),
         np.concatenate([part.elapsed_ns for part in parts]),
         np.concatenate([part.score for part in parts]),
+        **{
+            name: Nullable.of_recordings(name, parts).values
+            for name in OPTIONAL_COLUMNS
+            if any(name in part.columns for part in parts)
+        },
     )

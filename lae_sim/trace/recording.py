@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from lae_sim._arrays import Floats, Ints
+from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.engine.scheduler import Schedule
 from lae_sim.errors import LaeError
 
@@ -27,6 +27,10 @@ class Recording:
         boxes: the tracker's boxes, float64 [T, 4]; NaN = frame not processed.
         elapsed_ns: processing times in ns, int64 [T]; -1 = frame not processed.
         score: the tracker's confidence, float32 [T]; NaN = none.
+        arrival_ns: when each frame arrived, ns after the first, int64 [T], ascending from 0; None =
+            at the world's frame rate.
+        visible: False where the annotators say that the target is absent or fully covered, bool
+            [T]; None = they say nothing.
 
     Example:
         >>> import lae_sim
@@ -42,6 +46,8 @@ class Recording:
     boxes: Floats
     elapsed_ns: Ints
     score: npt.NDArray[np.float32]
+    arrival_ns: Ints | None = None
+    visible: Bools | None = None
 
     def __len__(self) -> int:
         """Number of world frames T."""
@@ -58,7 +64,13 @@ class Recording:
         columns = {"sequence": self.name, "frame": np.arange(len(self))}
         columns |= dict(zip(("truth_x", "truth_y", "truth_w", "truth_h"), self.truth.T))
         columns |= dict(zip(("x", "y", "w", "h"), self.boxes.T))
-        return pd.DataFrame({**columns, "elapsed_ns": self.elapsed_ns, "score": self.score})
+        columns |= {"elapsed_ns": self.elapsed_ns, "score": self.score}
+        return pd.DataFrame(columns | {name: getattr(self, name) for name in self.columns})
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Those of :data:`OPTIONAL_COLUMNS` that it has."""
+        return tuple(name for name in OPTIONAL_COLUMNS if getattr(self, name) is not None)
 
     @classmethod
     def new(
@@ -68,17 +80,16 @@ class Recording:
         boxes: npt.ArrayLike,
         elapsed_ns: npt.ArrayLike,
         score: npt.ArrayLike | None = None,
+        arrival_ns: npt.ArrayLike | None = None,
+        visible: npt.ArrayLike | None = None,
     ) -> Recording:
-        """A recording from anything array-like (not copied); ``score`` defaults to none.
+        """A recording from anything array-like (not copied); what is optional defaults to none.
 
         Raises:
             LaeError: if the lengths differ, or something is not made of numbers.
         """
         try:
-            with np.errstate(invalid="ignore"):
-                times = np.asarray(elapsed_ns, np.int64)
-            if not np.array_equal(times, elapsed_ns):
-                raise LaeError(f"{name}: elapsed_ns: times are whole nanoseconds")
+            times = _whole(elapsed_ns, f"{name}: elapsed_ns")
             no_score = np.full(len(times), np.nan, np.float32)
             recording = cls(
                 name,
@@ -86,12 +97,16 @@ class Recording:
                 np.asarray(boxes, np.float64).reshape(-1, 4),
                 times,
                 no_score if score is None else np.asarray(score, np.float32),
+                None if arrival_ns is None else _whole(arrival_ns, f"{name}: arrival_ns"),
+                None if visible is None else _flags(visible, f"{name}: visible"),
             )
         except (TypeError, ValueError) as error:
             raise LaeError(f"{name}: not boxes [T, 4] and times in ns [T]: {error}") from error
-        lengths = {len(recording.truth), len(recording.boxes), len(times), len(recording.score)}
+        per_frame = ["truth", "boxes", "elapsed_ns", "score", *recording.columns]
+        lengths = {len(getattr(recording, each)) for each in per_frame}
         if len(lengths) != 1:
-            raise LaeError(f"{name}: truth, boxes, times and scores differ in length: {lengths}")
+            what = ", ".join(per_frame)
+            raise LaeError(f"{name}: differ in length: {what}: {sorted(lengths)}")
         return recording
 
     @classmethod
@@ -102,6 +117,7 @@ class Recording:
         boxes: Floats,
         truth: Floats,
         score: npt.NDArray[np.float32] | None = None,
+        visible: Bools | None = None,
     ) -> Recording:
         """The real-time recording of a schedule.
 
@@ -111,6 +127,7 @@ class Recording:
             boxes: the box of each processed frame, float64 [n, 4].
             truth: ground truth of every world frame, float64 [T, 4].
             score: the confidence of each processed frame, float32 [n], if known.
+            visible: whether the target is, in every world frame, bool [T], if known.
         """
         all_boxes = np.full((schedule.length, 4), np.nan)
         elapsed = np.full(schedule.length, -1, np.int64)
@@ -118,7 +135,29 @@ class Recording:
         all_boxes[schedule.frames] = boxes
         all_scores[schedule.frames] = np.nan if score is None else score
         elapsed[schedule.frames] = schedule.elapsed_ns
-        return cls.new(name, truth, all_boxes, elapsed, all_scores)
+        clock, arrivals = schedule.clock, None
+        if not clock.is_even:
+            arrivals = clock.arrival(np.arange(schedule.length)) // clock.ticks_per_ns
+        return cls.new(name, truth, all_boxes, elapsed, all_scores, arrivals, visible)
+
+
+OPTIONAL_COLUMNS: Mapping[str, type[np.generic]] = {"arrival_ns": np.int64, "visible": np.bool_}
+"""What a recording may have besides, by the names of its attributes and of a trace's columns."""
+
+
+def _whole(values: npt.ArrayLike, what: str) -> Ints:
+    with np.errstate(invalid="ignore"):
+        times = np.asarray(values, np.int64)
+    if not np.array_equal(times, values):
+        raise LaeError(f"{what}: times are whole nanoseconds")
+    return times
+
+
+def _flags(values: npt.ArrayLike, what: str) -> Bools:
+    flags: Bools = np.asarray(values)
+    if flags.dtype != np.bool_:
+        raise LaeError(f"{what}: a flag is True or False, not of type {flags.dtype}")
+    return flags
 
 
 BATCH_ROWS = 1 << 15

@@ -156,20 +156,20 @@ def commit(checkout: Path) -> str | None:
     try:
         git = checkout / ".git"
         if git.is_file():  # a submodule or a further work tree: "gitdir: PATH"
-            git = checkout / git.read_text().partition(":")[2].strip()
-        head = (git / "HEAD").read_text().strip()
+            git = checkout / git.read_text("utf-8").partition(":")[2].strip()
+        head = (git / "HEAD").read_text("utf-8").strip()
         if not head.startswith("ref:"):
             return head
         name = head.partition(":")[2].strip()
         common = git / "commondir"  # refs of a further work tree lie in the main one's folder
-        folders = [git, git / common.read_text().strip()] if common.is_file() else [git]
+        folders = [git, git / common.read_text("utf-8").strip()] if common.is_file() else [git]
         for folder in folders:
             if (folder / name).is_file():
-                return (folder / name).read_text().strip()
+                return (folder / name).read_text("utf-8").strip()
             packed = folder / "packed-refs"
-            for line in packed.read_text().splitlines() if packed.is_file() else ():
+            for line in packed.read_text("utf-8").splitlines() if packed.is_file() else ():
                 if line.endswith(" " + name):
                     return line.split()[0]
-    except OSError:
+    except (OSError, ValueError):
         pass
     return None

@@ -10,7 +10,7 @@ from typing import Any
 
 import cv2
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed
 from lae_sim.trackers.protocol import Image, checked_box, checked_frame, weights_digest
 
 _MAIN = {"mil": "MIL", "nano": "Nano", "vit": "Vit", "dasiamrpn": "DaSiamRPN", "goturn": "GOTURN"}
@@ -122,15 +122,21 @@ class OpenCv:
         """The target's box in the next frame, with a score if the tracker has one, or None.
 
         Raises:
-            LaeError: if ``init`` was not called, or the frame is not of the first one's size.
+            LaeError: if ``init`` was not called, or the tracker cannot go on where frames change
+                size (MedianFlow and TLD).
         """
         if self._tracker is None:  # OpenCV would end the process
             raise LaeError(f"opencv:{self._name}: init must come before track")
         frame = checked_frame(frame)
-        if frame.shape != self._shape:
+        try:
+            found, box = self._tracker.update(frame)
+        except cv2.error as error:
+            if frame.shape == self._shape:
+                raise
             sizes = " to ".join(f"{s[1]} x {s[0]}" for s in (self._shape, frame.shape))
-            raise LaeError(f"opencv:{self._name}: the frames change from {sizes} pixels")
-        found, box = self._tracker.update(frame)
+            raise LaeError(
+                f"opencv:{self._name} cannot go on where frames change from {sizes} pixels"
+            ) from error
         if not found:
             return None
         score = getattr(self._tracker, "getTrackingScore", float)()
@@ -194,7 +200,7 @@ def _checked_files(name: str, given: dict[str, str]) -> dict[str, str]:
     wanted = list(_FILES.get(name, {}))
     extra = [option for option in given if option not in wanted]
     if extra:
-        raise LaeError(f"opencv:{name} takes no {', '.join(extra)}")
+        raise LaeError(f"opencv:{name} takes no {listed(extra)}")
     lacking = [option for option in wanted if not Path(given.get(option, "")).is_file()]
     if lacking:
         missing = ", ".join(f"{o}={given.get(o, 'FILE')}" for o in lacking)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed
 from lae_sim.trackers.checkout import (
     commit,
     existing,
@@ -165,7 +165,7 @@ class PySot:
                 name = name or next(iter(found))
                 return getattr(self._import(found[name]), name)
             if found and (not name or pattern == patterns[-1]):
-                raise LaeError(f"{package}: set the option {option} to one of {', '.join(found)}")
+                raise LaeError(f"{package}: set the option {option} to one of {listed(found)}")
         raise LaeError(f"{package}: no {option} in {' or '.join(patterns)}; is it a fork of pysot?")
 
     def _weights(self, network: Any) -> dict[str, Any]:

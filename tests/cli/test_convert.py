@@ -8,6 +8,7 @@ import pytest
 import scipy.io
 
 from lae_sim.cli.convert import main
+from lae_sim.cli.replay import main as replay_main
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.learning.registry import load_forecaster
@@ -88,6 +89,7 @@ def test_json(world, convert):
         "median_ms": 20.0000005,
         "times_read_as": "seconds per frame, as no unit was given",
         "held": {},
+        "frame_times": None,
         "row_0_from_truth": [],
         "other_trackers": [],
         "without_truth": [],
@@ -399,3 +401,58 @@ def test_otb_tiger1_needs_its_own_truth(shared_data, tmp_path, capsys):
     other = ["--truth-file", f"Tiger1={otb / 'anno_alt' / 'Tiger1_354.txt'}"]
     assert main([*arguments, *other]) == 0
     assert "kcf on OTB100, 1 sequences, 354 frames" in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------------------ flags of absence
+
+
+def lasot(world, **files):
+    """A LaSOT folder of one sequence, which is left where it was last seen while it is absent."""
+    box, path = [50, 40, 40, 30], world / "LaSOT" / "ball" / "ball-1"
+    still = [box[0] + 4 * 4, box[1] + 2 * 4, *box[2:]]
+    rows = [[box[0] + 4 * i, box[1] + 2 * i, *box[2:]] for i in range(10)]
+    write(path / "groundtruth.txt", [*rows[:5], *[still] * 4, rows[9]], ",")
+    write(world / "boxes" / "ball-1.txt", [*rows[:5], *[still] * 4, rows[9]], ",")
+    for name, text in files.items():
+        (path / f"{name}.txt").write_text(text)
+    return path
+
+
+FLAGS = {"full_occlusion": "0,0,0,0,0,1,1,0,0,0", "out_of_view": "0,0,0,0,0,0,0,1,1,0"}
+
+
+def test_flags_of_absence_reach_the_trace_and_the_convention_that_needs_them(
+    world, convert, capsys
+):
+    lasot(world, **FLAGS)
+    status, out, _ = convert("boxes", "--time", "constant:1ms", truth="LaSOT")
+    assert status == 0
+    assert "absent in 4 frames, in 1 of 1 sequences; --convention lasot leaves them out" in out
+    [recording] = read_trace(world / "t.parquet")
+    assert recording.visible.tolist() == [True] * 5 + [False] * 4 + [True]
+    for convention, auc, dp20 in (("lasot", 0.5714, 0.6), ("pysot", 0.9524, 1.0)):
+        options = [str(world / "t.parquet"), "--convention", convention, "--json"]
+        assert replay_main(options) == 0
+        [report] = json.loads(capsys.readouterr().out)["traces"]
+        assert round(report["offline"]["auc"], 4) == auc
+        assert report["offline"]["dp20"] == dp20
+        notes = [note for note in report["notes"] if "absent" in note]
+        assert notes == [] if convention == "lasot" else "4 frames in 1 of 1 sequences" in notes[0]
+
+
+@pytest.mark.parametrize("text", ["0,0,0", "0,0,0,0,0,1,1,0,0,x", ""])
+def test_damaged_flags_do_not_stop_a_conversion(world, convert, text):
+    path = lasot(world, **{**FLAGS, "out_of_view": text})
+    status, out, _ = convert("boxes", "--time", "constant:1ms", truth="LaSOT")
+    assert status == 0
+    assert f"Note: sequence 'ball-1': flags of absence are left out: {path / 'out_of_view'}" in out
+    [recording] = read_trace(world / "t.parquet")
+    assert recording.visible is None
+    assert read_trace(world / "t.parquet").metadata.document["version"] == "1.0"
+
+
+def test_a_file_of_flags_is_not_replaced(world, convert):
+    path = lasot(world, **FLAGS) / "full_occlusion.txt"
+    paths = [str(world / "boxes"), "--truth", str(world / "LaSOT"), "--out", str(path)]
+    assert main([*paths, "--time", "constant:1ms", "--force"]) == 2
+    assert path.read_text() == FLAGS["full_occlusion"]

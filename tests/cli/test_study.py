@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -677,7 +677,7 @@ def test_without_a_scheduler_at_the_address(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="the extra distributed is not there")
     path = toml(tmp_path)
     told = study_command(path, "--scheduler", "tcp://127.0.0.1:9", cwd=tmp_path, status=2)
-    assert "no Dask scheduler at tcp://127.0.0.1:9" in told
+    assert "no Dask scheduler at 'tcp://127.0.0.1:9'" in told
 
 
 # ------------------------------------------------------------------------------ what goes wrong
@@ -808,22 +808,84 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_damaged_notes_of_a_cell_say_what_to_do(tmp_path: Path) -> None:
-    run(tmp_path)
-    for path in (tmp_path / "about").glob("*.json"):
-        path.write_text("{")
-    with pytest.raises(LaeError, match="delete it"):
-        run(tmp_path)
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a study of four cells."""
+    folder = tmp_path_factory.mktemp("finished")
+    run(folder)
+    return folder
 
 
-def test_a_damaged_cell_says_what_to_do(tmp_path: Path) -> None:
-    run(tmp_path)
-    path = next(iter((tmp_path / "results").glob("*.parquet")))
+def _cut_off(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-50])
+
+
+def _edited(path: Path) -> None:
+    path.write_text(path.read_text().replace("1", "2", 1))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        _cut_off,
+        _edited,
+        Path.unlink,
+        lambda path: path.write_text("{"),
+        lambda path: path.write_text("[1, 2]"),
+        lambda path: path.write_text('{"notes": 1}'),
+        lambda path: path.write_text("[" * 100_000),
+        lambda path: path.write_bytes(b"\xff"),
+    ],
+)
+def test_what_is_not_as_it_was_written_is_computed_again(
+    finished: Path, tmp_path: Path, damage: Callable[[Path], object]
+) -> None:
+    folder = Path(shutil.copytree(finished, tmp_path / "study"))
+    whole = contents(folder)
+    for path in (folder / "about").glob("*.json"):
+        damage(path)
+    assert run(folder).computed == 4
+    assert contents(folder) == whole
+
+
+def test_a_cell_that_is_cut_off_is_computed_again(finished: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(finished, tmp_path / "study"))
+    (folder / "results" / "notes.txt").write_text("foreign")
+    (folder / "about" / "mine").mkdir()
+    whole = contents(folder)
+    _cut_off(next(iter((folder / "results").glob("*.parquet"))))
+    assert run(folder).computed == 1
+    assert contents(folder) == whole
+
+
+def test_a_cell_of_other_columns_says_what_to_do(finished: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(finished, tmp_path / "study"))
+    path = next(iter((folder / "results").glob("*.parquet")))
+    size = path.stat().st_size
+    pd.read_parquet(path)[["trace", "sigma"]].iloc[:1].to_parquet(path)
+    other = path.read_bytes()
+    path.write_bytes(b"PAR1" + b"\0" * (size - len(other)) + other[4:])  # as long as before
     with pytest.raises(LaeError, match=f"{path.name}: damaged: delete it"):
-        run(tmp_path)
-    path.unlink()
-    assert run(tmp_path).computed == 1
+        run(folder)
+
+
+@pytest.mark.parametrize(
+    "name", ["summary.csv", "study.json", "report.html", "tables/ranking.tex", "tables"]
+)
+def test_what_could_not_be_written_is_said_before_the_work(name: str, tmp_path: Path) -> None:
+    run(tmp_path / "study")  # so that it is the folder of a study
+    shutil.rmtree(tmp_path / "study" / "results")
+    (tmp_path / "study" / "results").mkdir()
+    place = tmp_path / "study" / name
+    place.unlink(missing_ok=True)
+    place.parent.mkdir(exist_ok=True)
+    if name == "tables":
+        place.write_text("mine")
+    else:
+        place.mkdir()
+    with pytest.raises(LaeError, match=f"{place.name}: is there already"):
+        run(tmp_path / "study")
+    assert not list((tmp_path / "study" / "results").iterdir())
 
 
 def test_the_columns_are_those_that_are_documented(tmp_path: Path) -> None:

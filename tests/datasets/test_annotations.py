@@ -1,13 +1,18 @@
 import re
+import tempfile
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lae_sim.datasets.annotations import (
     Attributes,
     find_truth,
     read_attributes,
+    read_lost,
     read_truth,
     read_vatic,
 )
@@ -153,6 +158,9 @@ def test_nfs_of_30_frames_per_second_is_every_eighth_row(tmp_path):
     one_more = read_truth(slow, 4)
     assert one_more[:3].tolist() == [WAY[0], WAY[8], WAY[16]]
     assert np.isnan(one_more[3]).all()
+    make(tmp_path, "c/30/c.txt", text=vatic(WAY, lost=(8, 9)))
+    assert read_lost(tmp_path / "c/30/c.txt", 4).tolist() == [False, True, False, False]
+    assert read_lost(make(tmp_path, "d.txt") / "d.txt", 2) is None
     with pytest.raises(LaeError, match="is of 240 too: --fps 240"):
         read_truth(slow, 17)
     make(tmp_path, "b/30/b.txt", text=vatic(WAY[::8]))  # as somebody thinned it out
@@ -184,6 +192,56 @@ def test_bad_vatic(tmp_path, row, problem):
     make(tmp_path, "a.txt", text=vatic(WAY[:2]) + row)
     with pytest.raises(LaeError, match=problem):
         read_truth(tmp_path / "a.txt")
+
+
+ROWS = [
+    "1,2,3,4",
+    "1\t2\t3\t4",
+    "1.5, 2, 3, 4",
+    "1,2,5,1,6,7,0,8",
+    "0",
+    "nan",
+    "NaN,NaN,NaN,NaN",
+    "1,2,NaN,4",
+    '0 1 2 3 4 {} 0 0 0 "x"',
+    '0 1 2 3 4 {} 1 1 1 "a b" more',
+    '1 1 2 3 4 {} 0 0 0 "x"',
+    "0 1 2 3 4 {} 0 0 0",
+    "x,y,w,h",
+    "1,5;2,5",
+    "m1,2,3,4,5,6",
+    "[1, 2, 3, 4]",
+    "<xml>",
+    "",
+    "1e999,1,1,1",
+    "\0\ud83d",
+]
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(st.tuples(st.sampled_from(ROWS), st.integers(0, 12)), max_size=9),
+    st.one_of(st.none(), st.integers(1, 12)),
+)
+def test_any_rows_are_boxes_or_a_clear_refusal(rows, frames):
+    text = "\n".join(row.replace("{}", str(frame)) for row, frame in rows)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.txt")
+        path.write_bytes(text.encode("utf-8", "replace"))
+        refusal = None
+        try:
+            boxes, lost = read_truth(path, frames), read_lost(path, frames)
+        except LaeError as error:
+            refusal = str(error)
+        if refusal is not None:
+            assert refusal.startswith(str(path))
+            return
+        assert boxes.dtype == np.float64
+        assert boxes.shape == (len(boxes), 4)
+        known = np.isfinite(boxes)
+        assert (known.all(axis=1) == known.any(axis=1)).all()
+        if lost is not None:
+            assert lost.shape == (len(boxes),)
 
 
 @pytest.mark.parametrize(
@@ -223,6 +281,7 @@ def test_polygons_become_boxes_around_them(tmp_path):
         ("1,1,10,20,30,40,1,1,0.8\n2,1,10,20,30,40,1,1,0.9\n", "MOT's format .*keep x,y,w,h of"),
         ("1,-1,10,20,30,40,0.9\n1,-1,10,20,30,40,0.9\n", "MOT's format"),
         ("100,90,30,40,1,4,0,1\n", "VisDrone's detections"),
+        ("100,5,90,2,30,0,40,0\n100,5,90,5,30,0,40,1\n", "x, y, w, h with decimal commas"),
         ("m12,40,10,20,0,4\nm12,40,10,20,0,4\n", "masks of VOT"),
     ],
 )

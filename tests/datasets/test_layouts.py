@@ -76,16 +76,17 @@ def test_layouts_are_recognised(tmp_path, folder, pattern, file, name):
 
 
 def test_nfs_as_it_is_downloaded(tmp_path):
-    row = '0 1 2 4 6 {} 0 0 1 "ball"\n'
+    row = '0 1 2 4 6 {} {} 0 1 "ball"\n'
     for rate, count in ((30, 2), (240, 16)):
         images(tmp_path / "NfS" / "ball" / str(rate) / "ball", "%05d.jpg", range(1, count + 1))
         path = tmp_path / "NfS" / "ball" / str(rate) / "ball.txt"
-        path.write_text("".join(row.format(k) for k in range(1, 17)))
+        path.write_text("".join(row.format(k, int(k > 8)) for k in range(1, 17)))
         dataset = find_dataset(root=tmp_path / "NfS", fps=rate)
         (ball,) = dataset.sequences
         assert (dataset.name, dataset.fps, ball.name) == ("NfS", rate, "ball")
         assert ball.truth.tolist() == [[1, 2, 3, 4]] * count
         assert levels(ball) == [1, count]
+        assert ball.visible.tolist() == [True] * (count // 2) + [False] * (count // 2)
     with pytest.raises(LaeError, match="--fps 30 or --fps 240"):
         find_dataset(root=tmp_path / "NfS")
 
@@ -306,3 +307,19 @@ def test_what_is_missing_is_named(tmp_path, walk):
         find_dataset(root=tmp_path / "only")
     with pytest.raises(LaeError, match="no images there; --box needs a folder of images"):
         find_dataset(root=tmp_path / "only", box=(1, 2, 3, 4))
+
+
+def test_flags_of_absence_and_what_is_wrong_with_them(tmp_path):
+    for name in ("boat-1", "boat-2", "car-1"):
+        folder = tmp_path / name.partition("-")[0] / name
+        images(folder / "img", "%08d.jpg", range(1, 5))
+        truth(folder / "groundtruth.txt", 4)
+    (tmp_path / "boat" / "boat-1" / "out_of_view.txt").write_text("0,0,1,0")
+    (tmp_path / "boat" / "boat-2" / "out_of_view.txt").write_text("0,0,1")
+    dataset = find_dataset(root=tmp_path)
+    flags = [sequence.visible for sequence in dataset.sequences]
+    assert flags[0].tolist() == [True, True, False, True]
+    assert flags[1:] == [None, None]
+    [note] = dataset.notes
+    assert note.startswith("sequence 'boat-2': flags of absence are left out: ")
+    assert note.endswith("out_of_view.txt: 3 flags, and there are 4 frames")

@@ -48,6 +48,9 @@ def test_separators(written, text):
         ("1,5;2,5\n", 1, "decimal points, and one separator"),
         ("1,5 2,5\n", 1, "decimal points, and one separator"),
         ("1,2\n10\t2,5\n", 2, "decimal points, and one separator"),
+        ("0,047\n0,2\n", 1, "'0,047' looks like a number with a decimal comma"),
+        ("0,147\n0,2\n", 1, "write decimal points"),
+        ("1,5\n12,05\n", 1, "write decimal points"),
         ("x,y\n1,2\n", 1, "'x' is not a number; the line looks like a header: remove it"),
     ],
 )
@@ -103,5 +106,5 @@ def test_a_table_that_would_take_too_much_memory(written):
 def test_no_file(tmp_path):
     with pytest.raises(LaeError, match="no such file"):
         read_numbers(tmp_path / "none.txt")
-    with pytest.raises(LaeError, match="cannot be read"):
+    with pytest.raises(LaeError, match="a folder, not a file"):
         read_numbers(tmp_path)

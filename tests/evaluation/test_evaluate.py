@@ -49,8 +49,9 @@ from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
 from lae_sim.replay.latency import LatencySource, by_frame, constant, initialised
 from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.metadata import ImageSizes, Metadata
 from lae_sim.trace.recording import Recording
 
 CLOCK = Clock.at(Fraction(30))
@@ -83,7 +84,9 @@ def groups(draw: st.DrawFn) -> tuple[Fraction, list[Recording]]:
             truth[i] = draw(st.sampled_from([math.nan, 0.0]))
         for i in draw(st.sets(st.integers(0, len(boxes) - 1), max_size=4)):
             boxes[i] = draw(st.sampled_from([[0.0] * 4, [*boxes[i][:2], 9.0, -1.0]]))
-        recordings.append(Recording.new(f"s{s}", truth, boxes, elapsed))
+        flags = st.lists(st.booleans(), min_size=len(boxes), max_size=len(boxes))
+        visible = draw(st.none() | flags)
+        recordings.append(Recording.new(f"s{s}", truth, boxes, elapsed, visible=visible))
     return fps, recordings
 
 
@@ -111,9 +114,9 @@ def test_scores_agree_with_plain_loops_over_the_oracle(
                 assert told.source_frame.tolist() == psis
                 if forecaster == "hold":
                     assert told.boxes.tolist() == recording.boxes[psis].tolist()
-                    expected = scores(truth, told.boxes.tolist(), name)
+                    expected = scores(truth, told.boxes.tolist(), name, visible=recording.visible)
                 else:
-                    expected = scores(truth, told.boxes.tolist(), name, float)
+                    expected = scores(truth, told.boxes.tolist(), name, float, recording.visible)
                 for metric, value in expected.items():
                     value = math.nan if value is None else float(value)
                     score = found.scores[metric][f, s, m]
@@ -148,8 +151,10 @@ def test_curves_and_failures_agree_with_those_of_single_sequences(
     runs = [replay_sequence(recording, Clock.at(fps)) for recording in recordings]
     found = evaluate_runs(runs, EVERY, FORECASTERS, sigmas, convention)
     for s, run in enumerate(runs):
-        truth = run.recording.truth
+        truth, visible = run.recording.truth, run.recording.visible
         valid = convention.valid_success(truth)
+        if name == "lasot" and visible is not None:
+            valid &= visible
         for f, (forecaster, factory) in enumerate(FORECASTERS.items()):
             for m, sigma in enumerate(sigmas):
                 boxes = answers(run, EVERY, forecaster, factory, sigma).boxes
@@ -168,7 +173,8 @@ def test_curves_and_failures_agree_with_those_of_single_sequences(
                 if math.isnan(found.scores[metric][f, s, 0]):
                     assert np.isnan(curves[f, s]).all()
                 else:
-                    np.testing.assert_array_equal(curves[f, s], curve(truth, boxes, convention))
+                    expected = curve(truth, boxes, convention, visible)
+                    np.testing.assert_array_equal(curves[f, s], expected)
 
 
 @given(groups(), SIGMAS)
@@ -259,6 +265,32 @@ def test_kalman_lae_pvt_agrees_with_matrices_through_answers() -> None:
             np.testing.assert_allclose(told.boxes, expected, rtol=0, atol=1e-7)
     assert DenseLaePvt.hits["clipped"] > 100
     assert DenseLaePvt.hits["update"] > 100
+
+
+@pytest.mark.parametrize("dropped", [0, 3])
+def test_forecasts_are_clipped_to_images_that_change_size(dropped: int) -> None:
+    times = (np.arange(30) + dropped * (np.arange(30) > 9)) * 10**9 // 30
+    arrival_ns = times if dropped else None
+    boxes = np.array([[100.0 + 8 * i, 40, 40, 30] for i in range(30)])
+    other, recording = (
+        Recording.new(name, boxes, boxes, np.full(30, 90_000_000), arrival_ns=arrival_ns)
+        for name in "ab"
+    )
+    sizes = ImageSizes((0, 12, 20), ((640, 360), (250, 90), (640, 360)))
+    metadata = Metadata.new("30", "every-frame", sequences={"b": sizes.entry()})
+    runs = [replay_sequence(each, CLOCK) for each in (other, recording)]
+    freely, clipped = (answers(run, metadata, "kalman-lae-pvt", KalmanLaePvt).boxes for run in runs)
+    inside = slice(12, 20)
+    expected = freely.copy()
+    expected[inside, 2] = np.minimum(freely[inside, 0] + freely[inside, 2], 250) - freely[inside, 0]
+    kept = expected[:, 2] > 3  # where too little is left, the raw box answers
+    assert kept[:12].all()
+    assert (expected[inside][kept[inside], 2] < freely[inside][kept[inside], 2]).any()
+    np.testing.assert_allclose(clipped[kept], expected[kept], atol=1e-9)
+    forecasters = {"kalman-lae-pvt": KalmanLaePvt}
+    found = evaluate_runs(runs, metadata, forecasters)
+    notes = notes_on(found.replay, metadata, PYSOT, forecasters)
+    assert any("images of 1 of 2 sequences change size, such as those of 'b'" in n for n in notes)
 
 
 def test_the_initial_box_answers_until_the_first_output_is_fed() -> None:
@@ -491,3 +523,56 @@ def test_what_was_recorded_with_a_pre_forecaster_is_said_to_have_no_model() -> N
         found = evaluate_runs(runs, searched, {"hold": Hold}).replay
         notes = notes_on(found, searched, PYSOT, {"hold": Hold})
         assert [note.split(",")[0].split()[-1] for note in notes] == told
+
+
+def flagged(name: str, absent: int | None) -> Recording:
+    still = leaving(name, speed=0)
+    visible = None if absent is None else np.arange(len(still)) >= absent
+    return replace(still, visible=visible)
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_scored_frames_of_an_absent_target_are_said(name: str) -> None:
+    group = [flagged("a", 7), flagged("b", None), flagged("c", 0), flagged("d", 2)]
+    group[3] = replace(group[3], truth=group[3].truth.copy())
+    group[3].truth[0] = np.nan  # no truth, and nothing to score
+    runs = [replay_sequence(each, CLOCK) for each in group]
+    found = evaluate_runs(runs, EVERY, {"hold": Hold}).replay
+    notes = [n for n in notes_on(found, EVERY, CONVENTIONS[name], {"hold": Hold}) if "absent" in n]
+    if name == "lasot":
+        assert notes == [
+            "nothing says in 1 of 4 sequences where the target is absent: lasot counts every frame "
+            "with a truth there"
+        ]
+        return
+    assert notes == [
+        f"8 frames in 2 of 4 sequences are scored by {name} although their target is said to be "
+        "absent; --convention lasot leaves them out"
+    ]
+
+
+def test_lasot_says_where_no_sequence_has_flags() -> None:
+    def notes(*recordings: Recording) -> list[str]:
+        runs = [replay_sequence(each, CLOCK) for each in recordings]
+        found = evaluate_runs(runs, EVERY, {"hold": Hold}).replay
+        return notes_on(found, EVERY, CONVENTIONS["lasot"], {"hold": Hold})
+
+    assert notes(flagged("a", None)) == [
+        "nothing says where the target is absent: lasot counts every frame with a truth there"
+    ]
+    assert notes(flagged("a", 3), flagged("b", 0)) == []
+
+
+def test_modelled_scores_leave_absent_frames_out_too() -> None:
+    """Where a lost tracker's answers are off in those frames alone, nothing is lost."""
+    still = leaving("a", speed=0)
+    visible = np.arange(len(still)) < len(still) // 2
+    truth = still.truth.copy()
+    truth[~visible, 0] += 5000
+    recording = replace(still, truth=truth, boxes=truth.copy(), visible=visible)
+    search = SearchModel(np.ones(3), known=True, source="given")
+    run = replay_sequence(recording, CLOCK, constant("60ms"), search=search)
+    assert run.modelled is not None
+    found = evaluate_runs([run], EVERY, {"hold": Hold}, convention=CONVENTIONS["lasot"])
+    assert found.modelled.mean["dp20"].item() == found.scores["dp20"].item() == 0.5
+    assert evaluate_runs([run], EVERY, {"hold": Hold}).modelled.mean["dp20"].item() < 0.6

@@ -34,16 +34,16 @@ NONE = [math.nan] * 4
 EVERY = pytest.mark.parametrize("name", CONVENTIONS)
 
 
-def evaluated(truth: object, boxes: object, name: str) -> Evaluation:
+def evaluated(truth: object, boxes: object, name: str, visible: object = None) -> Evaluation:
     """A tracker without latency: its scores are the offline ones."""
-    recording = Recording.new("a", truth, boxes, np.zeros(len(boxes)))
+    recording = Recording.new("a", truth, boxes, np.zeros(len(boxes)), visible=visible)
     run = replay_sequence(recording, Clock.at(Fraction(30)))
     metadata = Metadata.new("30", "every-frame")
     return evaluate_runs([run], metadata, {"hold": Hold}, convention=CONVENTIONS[name])
 
 
-def offline(truth: object, boxes: object, name: str) -> dict[str, float]:
-    found = evaluated(truth, boxes, name)
+def offline(truth: object, boxes: object, name: str, visible: object = None) -> dict[str, float]:
+    found = evaluated(truth, boxes, name, visible)
     for metric in METRICS:  # without latency both are the same
         np.testing.assert_equal(found.scores[metric], found.offline[metric][None, :, None])
     return {metric: found.offline[metric].item() for metric in METRICS}
@@ -70,6 +70,8 @@ GOLDEN = [
         ("elae", 27 / (21 * 8), 7 / 8, 5 / 8, 256 / (51 * 8)),
         # for precision, too, a truth with x < 0 is none: frames 0, 1 and four hits
         ("otb", 40 / (21 * 8), 7 / 8, 6 / 8, 306 / (51 * 8)),
+        # as got10k, but the frame without truth is among those that are divided by
+        ("lasot", 47 / (21 * 8), 5 / 8, 2 / 8, 103 / (51 * 8)),
         ("got10k", 47 / (21 * 7), 5 / 7, 2 / 7, 103 / (51 * 7)),
         ("got10k-101", 234 / (101 * 7), 5 / 7, 2 / 7, 103 / (51 * 7)),
         ("exclude", 47 / (21 * 6), 4 / 6, 2 / 6, 103 / (51 * 6)),
@@ -84,7 +86,8 @@ def test_golden_values(
 
 
 def test_the_golden_values_reach_every_convention() -> None:
-    assert set(CONVENTIONS) == {"pysot", "elae", "otb", "got10k", "got10k-101", "exclude"}
+    known = {"pysot", "elae", "otb", "lasot", "got10k", "got10k-101", "exclude"}
+    assert set(CONVENTIONS) == known
 
 
 @EVERY
@@ -124,9 +127,9 @@ def test_one_truth_after_the_first_frame_is_enough(name: str) -> None:
     box = [100, 100, 30, 40]
     found = offline([box, NONE, box], [box] * 3, name)
     perfect = 100 / 101 if name == "got10k-101" else 20 / 21
-    left_out = CONVENTIONS[name].leaves_out
+    left_out = CONVENTIONS[name].leaves_out and name != "lasot"
     assert found["auc"] == pytest.approx(perfect if left_out else perfect * 2 / 3)
-    assert found["dp20"] == 1
+    assert found["dp20"] == (pytest.approx(2 / 3) if name == "lasot" else 1)
 
 
 @pytest.mark.parametrize(
@@ -176,6 +179,7 @@ def test_otb_takes_the_answer_before_one_that_is_not_finite(value: float) -> Non
         ("elae", 10 / 21, 1.0),
         ("otb", 10 / 21, 1.0),
         ("exclude", 20 / 21, 1.0),
+        ("lasot", 10 / 21, 0.5),
         ("got10k", 10 / 21, 0.5),
         ("got10k-101", 50 / 101, 0.5),
     ],
@@ -187,6 +191,39 @@ def test_a_row_of_zeros_is_a_missing_truth_but_for_got10k(
     found = offline([[0, 0, 0, 0], box], [box, box], name)
     assert found["auc"] == pytest.approx(auc)
     assert found["dp20"] == dp20
+
+
+# ------------------------------------------------------------------------------ absent targets
+
+FLAGGED = [True] * 5 + [False] * 4 + [True]
+MOVING = [[50.0, 40, 40, 30], [54.0, 42, 40, 30], [58.0, 44, 40, 30], [62.0, 46, 40, 30],
+          *[[66.0, 48, 40, 30]] * 5, [86.0, 58, 40, 30]]  # fmt: skip
+
+
+def test_lasot_leaves_absent_frames_out_and_divides_by_all() -> None:
+    """Four of ten frames are absent, with stale boxes as their truth."""
+    found = offline(MOVING, MOVING, "lasot", FLAGGED)
+    assert found["auc"] == pytest.approx(0.6 * 20 / 21)
+    assert found["dp20"] == found["norm_dp20"] == found["norm_auc"] == pytest.approx(0.6)
+    assert round(found["auc"], 4) == 0.5714
+
+
+@pytest.mark.parametrize("name", sorted(set(CONVENTIONS) - {"lasot"}))
+def test_other_conventions_score_absent_frames(name: str) -> None:
+    assert offline(MOVING, MOVING, name, FLAGGED) == offline(MOVING, MOVING, name)
+
+
+def test_the_answer_for_an_absent_frame_does_not_matter_to_lasot() -> None:
+    wrong = [[500.0, 400, 40, 30] if not v else box for v, box in zip(FLAGGED, MOVING)]
+    assert offline(MOVING, wrong, "lasot", FLAGGED) == offline(MOVING, MOVING, "lasot", FLAGGED)
+    assert evaluated(MOVING, wrong, "lasot", FLAGGED).failure.item() == len(MOVING)  # there is none
+    assert evaluated(MOVING, wrong, "lasot").failure.item() == 5
+
+
+def test_a_target_that_is_absent_from_frame_1_on_leaves_the_first_frame_to_lasot() -> None:
+    found = offline(MOVING, MOVING, "lasot", [True] + [False] * 9)
+    assert found["auc"] == pytest.approx(2 / 21)
+    assert found["dp20"] == 0.1
 
 
 def test_otb_drops_sequences_that_score_0_everywhere() -> None:
@@ -235,12 +272,16 @@ def array(truth: list[list[float] | None]) -> np.ndarray:
 
 
 @EVERY
-@given(case=tracked())
+@given(case=tracked(), data=st.data())
 @settings(max_examples=30)
-def test_metrics_agree_with_plain_loops_in_fractions(name: str, case: tuple) -> None:
+def test_metrics_agree_with_plain_loops_in_fractions(
+    name: str, case: tuple, data: st.DataObject
+) -> None:
     truth, answers = case
-    found = offline(array(truth), answers, name)
-    for metric, expected in scores(truth, answers, name).items():
+    flags = st.lists(st.booleans(), min_size=len(truth), max_size=len(truth))
+    visible = data.draw(st.none() | flags)
+    found = offline(array(truth), answers, name, visible)
+    for metric, expected in scores(truth, answers, name, visible=visible).items():
         value = math.nan if expected is None else float(expected)
         assert found[metric] == pytest.approx(value, abs=1e-12, nan_ok=True)
 
@@ -263,6 +304,10 @@ def test_normalised_precision_agrees_with_a_plain_loop(name: str, case: tuple) -
             valid = valid and min(true) > 0
         if name in ("exclude", "got10k", "got10k-101"):
             if not valid:
+                continue
+        elif name == "lasot":
+            if not valid:
+                errors.append(math.inf)  # left out, but divided by
                 continue
         elif not valid or true[0] + (true[2] - 1) / 2 <= 0 or true[1] + (true[3] - 1) / 2 <= 0:
             errors.append(-1.0)
@@ -291,13 +336,14 @@ def test_normalised_precision_agrees_with_a_plain_loop(name: str, case: tuple) -
 @settings(max_examples=30)
 def test_the_curves_agree_with_the_scores(name: str, case: tuple) -> None:
     truth, answers = array(case[0]), np.array(case[1])
+    visible = np.arange(len(truth)) % 3 < 2
     convention = CONVENTIONS[name]
     assume((truth[min(1, len(truth) - 1) :, 2:] > 0).all(axis=1).any())
-    success = success_curve(truth, answers, convention)
-    precision = precision_curve(truth, answers, convention)
+    success = success_curve(truth, answers, convention, visible)
+    precision = precision_curve(truth, answers, convention, visible)
     assert success.shape == convention.iou_thresholds.shape
     assert precision.shape == (51,)
-    found = offline(truth, answers, name)
+    found = offline(truth, answers, name, visible)
     if not (convention.drops_zeros and not success.any()):
         assert success.mean() == pytest.approx(found["auc"], abs=1e-12)
     if not (convention.drops_zeros and not precision.any()):

@@ -200,6 +200,24 @@ def test_fewer_restarts_where_there_are_no_more() -> None:
     assert own_starts(unknown, OWN_GAPS) == []
 
 
+def test_nothing_starts_from_or_jumps_to_frames_without_the_target(tmp_path: Path) -> None:
+    visible = np.ones(200, np.bool_)
+    visible[40:90] = False
+    hidden = replace(wandering("a"), visible=visible)
+    starts = sampled_starts([hidden], 1000, 1.25)["a"]
+    assert len(starts) > 100
+    assert all(
+        visible[frame]
+        for start in starts
+        for frame in (start.name.start, start.name.start + start.name.gap)
+    )
+    assert [start.name.gap for start in own_starts(hidden, (5, 40, 60, 95))] == [5, 95]
+    trace, _, _ = gap_pass(tmp_path, Dataset("d", Fraction(30), [hidden]), Reaching([0.7]))
+    assert all(recording.visible is not None for recording in trace)
+    for jump in own_jumps(trace)["a"]:  # what follows a jump may be absent, and is no truth then
+        assert np.isnan(jump.truth[:, 0]).tolist() == (~visible[jump.frames]).tolist()
+
+
 def test_own_jumps_of_a_short_sequence_end_with_it() -> None:
     short = ImageSequence("s", wandering("a").truth[:9], wandering("a").read)
     assert [start.frames for start in own_starts(short, OWN_GAPS)] == [

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from lae_sim.files import csv_cell
 from lae_sim.report.table import (
     PERCENT,
     SCORE,
@@ -49,7 +50,7 @@ TABLE = Table.of(COLUMNS, RECORDS, "t", "What there is")
 def test_a_column_reads_records_and_mappings(records: list[Tracker]) -> None:
     first, second = Table.of(COLUMNS[:2], records).rows
     assert first == (
-        Cell("slow ", "slow\n"),
+        Cell(r"slow\n", "slow\n"),
         Cell("0.512 [0.400, 0.600]", 0.51249, (0.4, 0.6)),
     )
     assert second == (Cell("fast & rough", "fast & rough"), UNKNOWN)
@@ -59,10 +60,10 @@ def test_text_is_aligned_and_leaves_intervals_out_if_asked() -> None:
     assert text_of(TABLE).splitlines() == [
         "tracker                        AUC    lost",
         "------------  --------------------  ------",
-        "slow          0.512 [0.400, 0.600]  -48.8%",
+        r"slow\n        0.512 [0.400, 0.600]  -48.8%",
         "fast & rough                     -       -",
     ]
-    assert text_of(TABLE, intervals=()).splitlines()[2] == "slow          0.512  -48.8%"
+    assert text_of(TABLE, intervals=()).splitlines()[2] == r"slow\n        0.512  -48.8%"
     assert legend_of(TABLE) == "AUC: mean over sequences"
 
 
@@ -78,8 +79,48 @@ def test_csv_has_numbers_in_full(tmp_path: Path) -> None:
 def test_latex_escapes_names_and_signs() -> None:
     lines = latex_of(TABLE).splitlines()
     assert lines[0] == "% What there is"
-    assert r"slow  & 0.512 {[}0.400, 0.600] & $-$48.8\% \\" in lines
+    assert r"slow\textbackslash{}n & 0.512 {[}0.400, 0.600] & $-$48.8\% \\" in lines
     assert r"fast \& rough & -- & -- \\" in lines
+
+
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [
+        ("*", "{*}"),  # the star of the line break before it
+        ("[x]", "{[}x]"),  # its optional argument
+        ("?`", "?{}`"),  # a ligature for the Spanish question mark
+        ("!`a``b", "!{}`a`{}`b"),
+        ("--", "-{}-"),
+        ("a---b", "a-{}-{}-b"),
+        ("-", "-"),
+        ("it''s", "it'{}'s"),
+        ("\\", r"\textbackslash{}"),
+        ('a<b>|c"', r"a\textless{}b\textgreater{}\textbar{}c\char34{}"),
+        ("Müller", "Müller"),
+    ],
+)
+def test_latex_holds_hostile_names(name: str, written: str) -> None:
+    table = Table.of(COLUMNS[:2], [Tracker(name, None)], "t")
+    lines = latex_of(table).splitlines()
+    assert rf"{written} & -- \\" in lines
+    assert not any(line.startswith("% compile") for line in lines)
+
+
+def test_latex_says_what_pdflatex_has_no_font_for() -> None:
+    text = latex_of(Table.of(COLUMNS[:1], [Tracker("追踪", 1.0)], "t"))
+    assert "% compile with lualatex or xelatex, and a font for 踪追" in text.splitlines()
+    assert r"追踪 \\" in text.splitlines()
+
+
+def test_csv_has_no_formulas(tmp_path: Path) -> None:
+    write_csv(Table.of(COLUMNS[:2], [Tracker("=2+3", -0.5)]), tmp_path / "t.csv")
+    with open(tmp_path / "t.csv", newline="", encoding="utf-8") as file:
+        assert list(csv.reader(file))[1] == ["'=2+3", "-0.5"]
+
+
+@pytest.mark.parametrize("text", ["-0.5", "-1/2", "+3", "car", "a=b", ""])
+def test_csv_leaves_numbers_and_other_texts(text: str) -> None:
+    assert csv_cell(text) == text
 
 
 def test_groups_stand_above_their_columns() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ import lae_sim.trace.file
 from lae_sim.errors import LaeError, TraceError
 from lae_sim.files import max_decoded
 from lae_sim.trace.file import Trace, read_trace, validate, write_trace
+from lae_sim.trace.locate import digest
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording, batched
 
@@ -46,8 +49,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def group() -> list[Recording]:
     """Sequences of several lengths, sorted by name; also names that need care."""
-    names = ["", "A b", "Z", "a", "a\0b", "a\nb", "aa", "../x", "é", "\U0001f600", "x" * 3000]
-    names = sorted(name for name in names if name)
+    names = sorted(["A b", "Z", "a", "a'b", "aa", "../x", "é", "\u202e", "\U0001f600", "x" * 3000])
     return [sparse(1 + 7 * i, i, name) for i, name in enumerate(names)]
 
 
@@ -123,6 +125,111 @@ def test_the_same_recordings_make_the_same_file(tmp_path: Path, group: list[Reco
     for name in ("one", "two"):
         write_trace(Trace(EVERY, group), tmp_path / name)
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+# ------------------------------------------------------------------------------ optional columns
+
+
+def arriving(recording: Recording, seed: int = 0) -> Recording:
+    steps = np.random.default_rng(seed).integers(2_000_000, 90_000_000, len(recording))
+    return replace(recording, arrival_ns=np.cumsum(steps) - steps[0])
+
+
+def flagged(recording: Recording, seed: int = 0) -> Recording:
+    return replace(recording, visible=np.random.default_rng(seed).random(len(recording)) < 0.7)
+
+
+def columns_in(path: Path) -> set[str]:
+    return set(pq.read_schema(path).names) - TYPES.keys()
+
+
+def version_in(path: Path) -> Any:
+    return read_trace(path).metadata.document["version"]
+
+
+@given(
+    kinds=st.lists(st.tuples(st.integers(1, 30), st.booleans()), min_size=1, max_size=5),
+    arrives=st.booleans(),
+    batch=st.integers(1, 40),
+)
+@settings(max_examples=40)
+def test_optional_columns_come_back(
+    tmp_path_factory: pytest.TempPathFactory,
+    kinds: list[tuple[int, bool]],
+    arrives: bool,
+    batch: int,
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "optional.parquet"
+    group = []
+    for i, (length, says) in enumerate(kinds):
+        recording = sparse(length, i, f"s{i}")
+        recording = arriving(recording, i) if arrives else recording
+        group.append(flagged(recording, i) if says else recording)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lae_sim.trace.file, "BATCH_ROWS", batch)
+        write_trace(Trace(EVERY, group), path)
+        assert_same(read_trace(path), group)
+        held_back = read_trace(path, group[-1].name)
+        assert_same(held_back, group[-1:])
+    has = {"arrival_ns": arrives, "visible": any(says for _, says in kinds)}
+    expected = {name for name in has if has[name]}
+    assert columns_in(path) == expected
+    assert version_in(path) == ("1.1" if expected else "1.0")
+    assert set(read_trace(path).columns) == expected
+    assert set(read_trace(path).to_frame().columns) == TYPES.keys() | expected
+
+
+def test_a_file_without_them_keeps_its_bytes(tmp_path: Path, group: list[Recording]) -> None:
+    write_trace(Trace(EVERY, group), tmp_path / "one")
+    write_trace(Trace(EVERY, iter(group), columns=frozenset()), tmp_path / "two")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+    assert version_in(tmp_path / "one") == "1.0"
+
+
+def test_a_frame_of_which_nothing_is_said_counts_as_visible(path: Path) -> None:
+    columns = columns_of([moving(4, 0, "a"), moving(2, 0, "b")])
+    columns["visible"] = [None, False, True, None, None, None]
+    write_plain(path, columns, {**MINIMAL, "version": "1.1"})
+    a, b = read_trace(path)
+    assert a.visible is not None
+    assert a.visible.tolist() == [True, False, True, True]
+    assert b.visible is None
+
+
+def test_a_stream_may_not_have_a_column_that_was_not_foreseen(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    group = [sparse(9, i, f"s{i}") for i in range(4)]
+    group[2] = flagged(group[2])
+    monkeypatch.setattr(lae_sim.trace.recording.batched, "__defaults__", (10,))
+    with pytest.raises(TraceError, match=r"sequence 's2' has visible, which the first ones lack"):
+        write_trace(Trace(EVERY, iter(group)), path)
+    assert not path.exists()
+    write_trace(Trace(EVERY, iter(group), columns=frozenset({"visible"})), path)
+    assert_same(read_trace(path), group)
+    write_trace(Trace(EVERY, group), path)  # all of a list is looked at
+    assert_same(read_trace(path), group)
+
+
+def test_a_recording_without_arrivals_among_others_is_refused(path: Path) -> None:
+    group = [arriving(sparse(9, 0, "a")), sparse(9, 1, "b")]
+    with pytest.raises(TraceError, match=r"'arrival_ns', sequence 'b', frame 0: null"):
+        write_trace(Trace(EVERY, group), path)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"visible": [True]}, "differ in length"),
+        ({"visible": [1, 0]}, "True or False"),
+        ({"arrival_ns": [0, 0.5]}, "whole nanoseconds"),
+        ({"arrival_ns": [0]}, "differ in length"),
+    ],
+)
+def test_what_a_recording_is_made_of_is_checked(given: dict[str, Any], message: str) -> None:
+    boxes = [[1, 2, 3, 4]] * 2
+    with pytest.raises(LaeError, match=message):
+        Recording.new("a", boxes, boxes, [1, 2], **given)
 
 
 # ------------------------------------------------------------------------ files of other writers
@@ -252,7 +359,7 @@ def test_times_as_fractions_are_guessed_to_be_seconds(path: Path, kind: pa.DataT
 
 
 def test_unknown_metadata_keys_are_kept(path: Path) -> None:
-    more = {"mine": {"deep": [1, 2.5, None, "é\ud800", True]}, "big": 2**70, "": 0}
+    more = {"mine": {"deep": [1, 2.5, None, "é\u2028", True]}, "big": 2**70, "": 0}
     metadata = Metadata.parse(write_and_dump(path, {**MINIMAL, **more}))
     assert {k: metadata.document[k] for k in more} == more
     write_trace(Trace(metadata, [moving(3)]), path)
@@ -282,8 +389,22 @@ def test_a_file_that_is_not_parquet(path: Path, content: bytes) -> None:
 
 
 def test_a_folder_is_not_a_trace(tmp_path: Path) -> None:
-    with pytest.raises(TraceError, match="not a readable Parquet file"):
+    with pytest.raises(TraceError, match="a folder, not a file"):
         read_trace(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes")
+def test_a_pipe_is_refused_at_once(tmp_path: Path) -> None:
+    """Opening it would wait for a writer for ever."""
+    os.mkfifo(tmp_path / "pipe.parquet")
+    os.symlink("pipe.parquet", tmp_path / "link.parquet")
+    for name in ("pipe.parquet", "link.parquet"):
+        with pytest.raises(TraceError, match=f"{name}: a pipe, not a file"):
+            read_trace(tmp_path / name)
+        with pytest.raises(LaeError, match="a pipe, not a file"):
+            digest(str(tmp_path / name))
+    with pytest.raises(TraceError, match="a device, not a file"):
+        validate(os.devnull)
 
 
 def test_a_truncated_file(path: Path) -> None:
