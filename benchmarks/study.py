@@ -71,7 +71,7 @@ def process(*arguments: str) -> Cost:
 
 def _children(pid: int) -> list[int]:
     try:
-        return [int(n) for n in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="utf-8").split()]
+        return [int(n) for n in Path(f"/proc/{pid}/task/{pid}/children").read_text("utf-8").split()]
     except OSError:
         return []
 

@@ -149,9 +149,18 @@ def test_a_digest_is_of_the_content(folder: Path, memory: Any) -> None:
             digest(path)
 
 
-def test_a_path_is_left_to_arrow() -> None:
-    with opened("any") as source:
-        assert source == "any"
+@pytest.mark.parametrize("name", ["any", "é", "\udcff"])
+def test_a_file_has_any_name(folder: Path, name: str) -> None:
+    path = os.fsencode(str(folder / name))
+    try:
+        with open(path, "wb") as file:
+            file.write(b"content")
+    except OSError:
+        pytest.skip("this file system holds no such names")
+    with opened(os.fsdecode(path)) as source:
+        assert source.read() == b"content"
+    with pytest.raises(FileNotFoundError), opened(str(folder / "none")):
+        pass
 
 
 def test_a_trace_is_read_from_a_url(folder: Path, memory: Any) -> None:
