@@ -71,7 +71,7 @@ def process(*arguments: str) -> Cost:
 
 def _children(pid: int) -> list[int]:
     try:
-        return [int(n) for n in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        return [int(n) for n in Path(f"/proc/{pid}/task/{pid}/children").read_text("utf-8").split()]
     except OSError:
         return []
 
@@ -79,7 +79,7 @@ def _children(pid: int) -> list[int]:
 def _peak(pid: int) -> float:
     """The high-water mark of one process, MiB."""
     try:
-        status = Path(f"/proc/{pid}/status").read_text()
+        status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
     except OSError:
         return 0.0
     return sum(int(line.split()[1]) / 1024 for line in status.splitlines() if "VmHWM" in line)

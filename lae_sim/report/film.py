@@ -17,7 +17,7 @@ from lae_sim.errors import LaeError
 from lae_sim.report.style import forecaster_colours
 
 if TYPE_CHECKING:
-    from lae_sim.datasets.frames import Image, ImageSequence
+    from lae_sim.datasets.frames import ImageSequence
     from lae_sim.evaluation.evaluate import Answers
     from lae_sim.forecast.base import AnyFactory
     from lae_sim.replay.run import Run

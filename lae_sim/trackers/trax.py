@@ -46,7 +46,6 @@ class Trax:
 
     def __init__(self, command: str, **parameters: Any) -> None:
         try:
-            import trax
             import trax.client
         except ImportError as error:
             raise LaeError(f"TraX is missing ({error}): pip install 'lae-sim[trax]'") from error

@@ -149,11 +149,17 @@ def test_a_digest_is_of_the_content(folder: Path, memory: Any) -> None:
             digest(path)
 
 
-def test_a_path_is_opened(tmp_path: Path) -> None:
-    (tmp_path / "any").write_bytes(b"bytes")
-    with opened(str(tmp_path / "any")) as source:
-        assert source.read() == b"bytes"
-    with pytest.raises(FileNotFoundError), opened(str(tmp_path / "none")):
+@pytest.mark.parametrize("name", ["any", "é", "\udcff"])
+def test_a_file_has_any_name(folder: Path, name: str) -> None:
+    path = os.fsencode(str(folder / name))
+    try:
+        with open(path, "wb") as file:
+            file.write(b"content")
+    except OSError:
+        pytest.skip("this file system holds no such names")
+    with opened(os.fsdecode(path)) as source:
+        assert source.read() == b"content"
+    with pytest.raises(FileNotFoundError), opened(str(folder / "none")):
         pass
 
 
