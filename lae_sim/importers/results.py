@@ -265,8 +265,8 @@ def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | 
     trackers = sorted({row["tracker"] or "" for row in rows if "tracker" in row})
     if trackers and tracker not in trackers:
         raise LaeError(
-            f"{path}: has {', '.join(trackers)}, not {tracker!r}; if it is there under another "
-            "name, give that with --tracker"
+            f"{path}: has {', '.join(trackers):.200}, not {tracker!r}; if it is there under "
+            "another name, give that with --tracker"
         )
     for number, row in enumerate(rows, 2):
         if row.get("tracker", tracker) != tracker:
