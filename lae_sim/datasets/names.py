@@ -18,6 +18,7 @@ _DATASET = re.compile(
     r"[a-z0-9]*_",
     re.IGNORECASE,
 )
+_PART = re.compile(r"(?:\d+|s)\Z")  # of a video, as in car1_s; no tracker is called so
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,8 @@ def _splits(written: str) -> list[tuple[str, str]]:
     at = [match.start() for match in re.finditer("_", written)]
     behind = [(written[:i], written[i + 1 :]) for i in reversed(at)]
     before = [(written[i + 1 :], written[:i]) for i in at]
-    return [(part, rest) for part, rest in (*behind, *before) if part and rest]
+    splits = (*behind, *before)
+    return [(part, rest) for part, rest in splits if part and rest and not _PART.match(rest)]
 
 
 def _folded(name: str) -> str:

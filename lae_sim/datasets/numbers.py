@@ -36,8 +36,7 @@ def read_lines(path: Path) -> list[str]:
         LaeError: if the file cannot be read, is empty, looks like another format (it says which),
             or would take too much memory (see :func:`lae_sim.files.max_decoded`).
     """
-    budget = Budget(path)
-    lines = [line.strip() for line in read_text(path, budget).splitlines()]
+    lines = [line.strip() for line in read_text(path, Budget(path)).splitlines()]
     while lines and not lines[-1]:
         lines.pop()
     if not lines:
@@ -57,7 +56,8 @@ def read_cells(
         lines: of the file, if they have been read.
 
     Raises:
-        LaeError: if the file cannot be read, is empty, has an empty line inside, or is ragged.
+        LaeError: if the file cannot be read, is empty, has an empty line inside, is ragged, or
+            would take too much memory (see :func:`lae_sim.files.max_decoded`).
     """
     budget = Budget(path)
     rows: list[list[str]] = []
@@ -126,7 +126,7 @@ def _number(cell: str) -> float:
 
 
 def read_text(path: Path, budget: Budget) -> str:
-    """A text file in UTF-8, with a mark at its beginning or without.
+    """A text file in UTF-8, or in UTF-16 with a mark at its beginning.
 
     Args:
         path: the file.

@@ -262,9 +262,35 @@ def _with_truth(
     path: Path, sources: Sequence[Source], truth: GroundTruth, tracker: str | None, skip: bool
 ) -> _Matched:
     """Match results of one tracker, the one that is asked for where there are several."""
+    by_tracker, missing = _by_tracker(sources, truth, tracker)
+    plain = by_tracker.pop("", {})
+    if plain and tracker not in by_tracker:  # what follows a sequence's name is part of it
+        chosen, others, matched = None, list[str](), plain
+        missing += [source.name for found in by_tracker.values() for source in found.values()]
+    else:
+        chosen, others = _one_tracker(path, sorted(by_tracker), tracker)
+        matched = by_tracker.get(chosen or "", {})
+        if others or plain:
+            missing = [name for name in missing if chosen in (name.split("_", 1)[0], *_tails(name))]
+    if not matched or (missing and not skip):
+        raise LaeError(
+            f"{truth.root}: no ground truth for {listed(sorted(missing))}, of {len(sources)} "
+            "results"
+            + ("; --skip-missing leaves them out" if matched else "; is it the right dataset?")
+        )
+    return _Matched(matched, chosen, sorted(missing), others)
+
+
+def _by_tracker(
+    sources: Sequence[Source], truth: GroundTruth, tracker: str | None
+) -> tuple[dict[str, dict[str, Source]], list[str]]:
+    """The results of each tracker by sequence, and the names of those of no known sequence.
+
+    Results whose names tell no tracker are those of tracker "".
+    """
     names = SequenceNames(truth.files)
     only_truth = next(iter(truth.files)) if truth.root.is_file() and len(sources) == 1 else None
-    by_tracker: dict[str | None, list[tuple[str, Source]]] = {}
+    by_tracker: dict[str, dict[str, Source]] = {}
     missing = []
     for source in sources:
         try:
@@ -275,25 +301,15 @@ def _with_truth(
             reading = Reading(only_truth)
         if reading is None:
             missing.append(source.name)
-        else:
-            by_tracker.setdefault(reading.tracker, []).append((reading.sequence, source))
-    chosen, others = _one_tracker(path, by_tracker, tracker)
-    if others:
-        missing = [name for name in missing if chosen in (name.split("_", 1)[0], *_tails(name))]
-    matched: dict[str, Source] = {}
-    for name, source in by_tracker.get(chosen, []):
-        if name in matched:
+            continue
+        results = by_tracker.setdefault(reading.tracker or "", {})
+        other = results.setdefault(reading.sequence, source)
+        if other is not source:
             raise LaeError(
-                f"{source.path} and {matched[name].path} are both results of sequence {name!r}; "
-                "give the folder or file of one tracker"
+                f"{source.path} and {other.path} are both results of sequence "
+                f"{reading.sequence!r}; give the folder or file of one tracker"
             )
-        matched[name] = source
-    if not matched or (missing and not skip):
-        raise LaeError(
-            f"{truth.root}: no ground truth for {listed(missing)}, of {len(sources)} results"
-            + ("; --skip-missing leaves them out" if matched else "; is it the right dataset?")
-        )
-    return _Matched(matched, chosen, missing, others)
+    return by_tracker, missing
 
 
 def _tails(name: str) -> list[str]:
@@ -302,25 +318,20 @@ def _tails(name: str) -> list[str]:
 
 
 def _one_tracker(
-    path: Path, by_tracker: Mapping[str | None, list[tuple[str, Source]]], wanted: str | None
+    path: Path, found: Sequence[str], wanted: str | None
 ) -> tuple[str | None, list[str]]:
     """The tracker whose results are taken, and the others that lie there.
 
     Raises:
         LaeError: if there are several, and none of them is the one that is wanted.
     """
-    if len(by_tracker) < 2:
-        return next(iter(by_tracker), None), []
-    known = sorted(tracker for tracker in by_tracker if tracker)
-    if wanted and wanted in by_tracker:
-        return wanted, [tracker for tracker in known if tracker != wanted]
-    found = f"results of {len(known)} trackers ({listed(known, 20)})"
-    if None in by_tracker:
-        plain = [source.path.name for _, source in by_tracker[None]]
-        found += f" and files that name none ({listed(plain, 3)})"
+    if len(found) < 2:
+        return next(iter(found), None), []
+    if wanted in found:
+        return wanted, [tracker for tracker in found if tracker != wanted]
     raise LaeError(
-        f"{path}: holds {found}; "
-        + (f"none is {wanted!r}{hint(wanted, known)}" if wanted else "choose one with --tracker")
+        f"{path}: holds results of {len(found)} trackers ({listed(found, 20)}); "
+        + (f"none is {wanted!r}{hint(wanted, found)}" if wanted else "choose one with --tracker")
     )
 
 

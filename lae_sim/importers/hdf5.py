@@ -35,7 +35,8 @@ def load_hdf5(path: Path) -> dict[str, Any]:
     """The variables of a file by name, as :func:`lae_sim.importers.matlab.load_matlab` gives them.
 
     Raises:
-        LaeError: if h5py is not installed, or the file is damaged or larger than any result.
+        LaeError: if h5py is not installed, the file is damaged, or larger than any result (see
+            :func:`lae_sim.files.max_decoded`).
     """
     try:
         import h5py
@@ -55,7 +56,7 @@ def load_hdf5(path: Path) -> dict[str, Any]:
 
 
 class _Reader:
-    """Reads values of a file, as long as they are no more than a budget of bytes."""
+    """Reads values of a file within a budget."""
 
     def __init__(self, h5: Any, file: h5py.File, budget: Budget) -> None:
         self._h5 = h5
@@ -138,18 +139,18 @@ class _Reader:
     def _check_chunks(self, dataset: h5py.Dataset, plan: Any) -> None:
         """Refuse chunks that unpack to more than their size, which HDF5 would find out too late."""
         size = math.prod(dataset.chunks) * dataset.dtype.itemsize
+        self._budget.take(size)
         filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
         packed = filters == [self._h5.h5z.FILTER_DEFLATE]
         if filters and not packed:
             raise ValueError("it is packed as MATLAB packs none")
         count = dataset.id.get_num_chunks()
-        if size > self._budget.left or count > _MAX_CHUNKS:
-            raise ValueError("it is too large")
+        if count > _MAX_CHUNKS:
+            raise ValueError("it is in too many pieces")
         for i in range(count):
             chunk = dataset.id.get_chunk_info(i)
-            if chunk.size > self._budget.left:
-                raise ValueError("it is too large")
+            self._budget.take(chunk.size)
             if packed and not chunk.filter_mask:
                 _, raw = dataset.id.read_direct_chunk(chunk.chunk_offset)
                 if len(zlib.decompressobj().decompress(raw, size + 1)) > size:
-                    raise ValueError("it is too large when unpacked")
+                    raise ValueError("it unpacks to more than it says")

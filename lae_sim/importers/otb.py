@@ -42,7 +42,8 @@ def load_json(path: Path) -> Any:
     """The values of a JSON file.
 
     Raises:
-        LaeError: if it is damaged, or larger than any result.
+        LaeError: if it is damaged, or larger than any result (see
+            :func:`lae_sim.files.max_decoded`).
     """
     try:
         within_budget(path, path.stat().st_size)

@@ -41,7 +41,9 @@ def test_a_name_means_a_sequence_and_perhaps_a_tracker(
     assert SequenceNames(OTB).read(written) == Reading(sequence, tracker)
 
 
-@pytest.mark.parametrize("written", ["nothing", "person12_ECO", "bike1KCF", "", "_", "_bike", "2"])
+@pytest.mark.parametrize(
+    "written", ["nothing", "person12_ECO", "bike1KCF", "", "_", "_bike", "2", "bike1_2", "bike1_s"]
+)
 def test_a_name_that_fits_nothing(written: str) -> None:
     assert SequenceNames(OTB).read(written) is None
 

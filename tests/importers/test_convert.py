@@ -93,10 +93,22 @@ def test_one_of_several_trackers_in_a_folder(folder: Path, suffix: str) -> None:
         results, folder / "D", tracker="ECO", skip_missing=True, **settings
     )
     assert (summary.sequences, summary.without_truth) == (1, ["zzz_ECO"])
-    np.savetxt(results / "a.txt", BOXES, "%g", ",")
-    if suffix == ".txt":
-        with pytest.raises(LaeError, match=r"3 trackers .* and files that name none \(a\.txt\)"):
-            convert_results(results, folder / "D", **settings)
+
+
+def test_what_follows_a_sequence_is_no_tracker_beside_files_that_name_none(folder: Path) -> None:
+    results = folder / "kcf"
+    results.mkdir()
+    for name in ("a", "b", "b_MY", "c_s"):
+        np.savetxt(results / f"{name}.txt", BOXES + len(name), "%g", ",")
+    settings: dict[str, Any] = {"time": "mean-fps:20"}
+    with pytest.raises(LaeError, match="no ground truth for b_MY, c_s, of 4 results; --skip-miss"):
+        convert_results(results, folder / "D", **settings)
+    trace, summary = convert_results(results, folder / "D", skip_missing=True, **settings)
+    assert (summary.tracker, trace.names) == ("kcf", ("a", "b"))
+    assert summary.without_truth == ["b_MY", "c_s"]
+    trace, summary = convert_results(results, folder / "D", tracker="MY", **settings)
+    np.testing.assert_array_equal(trace["b"].boxes[1:], BOXES[1:] + 4)
+    assert (trace.names, summary.tracker) == (("b",), "MY")
 
 
 def test_names_say_which_tracker_it_was(folder: Path) -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from lae_sim._arrays import Floats
 from lae_sim.datasets.annotations import find_truth, read_truth
+from lae_sim.datasets.names import SequenceNames
 from lae_sim.errors import LaeError
 from lae_sim.importers.convert import convert_results
 from lae_sim.importers.coordinates import other_reading, row_0_is_off
@@ -172,11 +173,13 @@ def _published(shared_data: Path) -> Iterator[tuple[str, Floats, Floats]]:
     results = (shared_data / "results_boxes").glob("*/*.npz")
     for path in [*results, *(shared_data / "results_with_times").glob("*/*")]:
         truth = find_truth(shared_data / path.parent.name)
+        names = SequenceNames(truth.files)
         kind, sources = find_results(path, "auto", 1)
         for source in sources:
-            name = truth.match(source.name)
-            if name is None:
+            reading = names.read(source.name)
+            if reading is None:
                 continue
+            name = reading.sequence
             boxes = read_results(kind, source, 1, None, measured=False).boxes
             answers = read_truth(truth.files[name])
             if len(answers) == len(boxes):
