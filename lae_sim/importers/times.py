@@ -99,6 +99,8 @@ def read_times(path: Path, unit: str | None = None, column: int = 0) -> tuple[In
         if not NUMBER.match(cell) or cell.startswith("-"):
             raise LaeError(f"{path}, line {number}: {cell[:40]!r} is not a processing time")
         values.append(Fraction(cell))
+        if values[-1] > MAX_INT64:  # in whatever unit
+            raise LaeError(f"{path}, line {number}: {cell[:40]} is too long a time")
     if unit is None and looks_cumulative(np.array(values, np.float64)):
         raise LaeError(f"{path}: {_question_of_sums(values)}")
     return _elapsed(values, unit or "s", path, first_line), unit

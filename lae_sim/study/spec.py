@@ -151,7 +151,7 @@ class Study:
         values = {}
         for key, value in document.items():
             if key not in _KEYS:
-                raise LaeError(f"unknown key {key!r}{_meant(key)}")
+                raise LaeError(f"unknown key {shown(key)}{_meant(key)}")
             name, parse = _KEYS[key]
             values[name] = named(key, parse, value)
         if "traces" not in values:

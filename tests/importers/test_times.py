@@ -132,9 +132,10 @@ def test_no_time(written, cell):
 
 
 def test_a_huge_number_is_refused_quickly(written):
-    for text in ("1e999999999\n", "9" * 10_000 + "\n"):
-        with pytest.raises(LaeError, match=r"car_time\.txt"):
-            read_times(written(text))
+    for text in ("1e999999999\n", "9" * 10_000 + "\n", "1e999\n", "1\n2\n1e400\n"):
+        for unit in (None, *UNITS):
+            with pytest.raises(LaeError, match=r"car_time\.txt"):
+                read_times(written(text), unit)
 
 
 def test_no_such_unit():
