@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -143,6 +144,21 @@ def sequence_names(sequences: str | Iterable[str]) -> list[str]:
     if not names:
         raise LaeError("sequences: name at least one")
     return names
+
+
+def check_regular(path: str | os.PathLike[str]) -> None:
+    """Refuse to read what is there but no file, such as a pipe, which might never end.
+
+    Raises:
+        LaeError: if it is a folder, a pipe, a socket or a device.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return  # which reading it will tell
+    if not stat.S_ISREG(mode):
+        what = "folder" if stat.S_ISDIR(mode) else "pipe" if stat.S_ISFIFO(mode) else "device"
+        raise LaeError(f"{path}: a {what}, not a file: write it to a file, and give that")
 
 
 def check_folders(paths: Iterable[str]) -> None:

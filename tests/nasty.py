@@ -10,7 +10,7 @@ from lae_sim.trace.file import Trace, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
-NASTY = '<script>alert(1)</script> a_b & 50% #1 $x$ {~^\\} "q"\'\n'
+NASTY = '<script>alert(1)</script> a_b & 50% #1 $x$ {~^\\} "q"\'\u2028'
 
 
 def nasty_traces(folder: Path) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from lae_sim.forecast.base import Lanes, forecast
+from lae_sim.trace.metadata import ImageSizes
 
 
 @st.composite
@@ -31,7 +32,13 @@ def lanes_and_queries(
         random.random((len(lengths), 1)) < 0.3, np.inf, random.integers(200, 700, (len(lengths), 2))
     )
     offsets = np.cumsum([0, *lengths])
-    lanes = Lanes(offsets, np.concatenate(frames).astype(np.int64), np.concatenate(boxes), sizes)
+    resized = {}
+    for lane in np.flatnonzero(np.isfinite(sizes[:, 0]) & (random.random(len(lengths)) < 0.3)):
+        later = random.integers(100, 700, (random.integers(1, 4), 2)).tolist()
+        starts = np.sort(random.choice(np.arange(1, 40), len(later), replace=False))
+        resized[int(lane)] = ImageSizes.of([0, *starts], [sizes[lane], *later])
+    fed = np.concatenate(frames).astype(np.int64)
+    lanes = Lanes(offsets, fed, np.concatenate(boxes), sizes, None, resized)
     item = np.sort(random.integers(0, offsets[-1], 3 * offsets[-1]))
     ahead = random.integers(0, 9, len(item))
     return lanes, item, lanes.frames[item] + ahead

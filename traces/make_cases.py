@@ -200,6 +200,10 @@ def write_invalid(folder: Path) -> None:
     bad_document("image-size-text", "image_size", sequences={"a": {"image_size": "640x480"}})
     bad_document("attributes-text", "attributes", sequences={"a": {"attributes": "Occlusion"}})
     bad_document("tracker-text", "tracker", tracker="example")
+    bad_document("text-escape", "tracker.name", "control character", tracker={"name": "\x1b[2J"})
+    bad_document("text-newline", "note", "control character", note=["one", "two\nthree"])
+    bad_document("text-in-key", "control character", settings={"\0": 1})
+    bad_document("text-half-character", "tracker.name", "Unicode", tracker={"name": "\ud800"})
     for name, word, search in (
         ("search-text", "search", "near"),
         ("search-without-side", "half_side", {"window": True}),
@@ -241,6 +245,10 @@ def write_invalid(folder: Path) -> None:
     bad("frame-0-not-processed", "'b'", "frame 0", columns=first_skipped)
     bad("box-nan", "'h'", "'b'", "frame 3", "nan", columns=changed("h", 7, float("nan")))
     bad("truth-infinite", "truth_x", "inf", columns=changed("truth_x", 1, float("inf")))
+    for name, value in (("score-nan", float("nan")), ("score-infinite", float("inf"))):
+        bad(name, "score", "'a'", "frame 2", "finite or null", columns=changed("score", 2, value))
+    named = mapped(lambda name: f"{name}\r", "sequence")
+    bad("sequence-control-character", "sequence", "control character", columns=named)
     bad("time-negative", "elapsed_ns", "negative", columns=changed("elapsed_ns", 3, -5))
 
     for name, row, words, change in (

@@ -9,7 +9,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser, print_json
+from lae_sim.cli.options import (
+    add_frame_times,
+    argument,
+    exit_status,
+    new_parser,
+    print_json,
+)
 from lae_sim.errors import LaeError, listed
 from lae_sim.files import check_distinct
 from lae_sim.progress import ProgressBar, print_text
@@ -133,6 +139,8 @@ def _convert(arguments: argparse.Namespace) -> None:
 
 def _text(summary: ConversionSummary, out: Path) -> str:
     """The summary for people."""
+    from lae_sim.datasets.dropped import note
+
     processed = "every frame"
     if summary.schedule == "real-time":
         processed = f"in real time, {summary.processed:,} processed"
@@ -144,17 +152,20 @@ def _text(summary: ConversionSummary, out: Path) -> str:
     ]
     if "note" in summary.timing:
         lines.append(f"Note: {summary.timing['note']}.")
+    if summary.frame_times:
+        said = note(summary.numbers_missing, summary.frame_times)
+        lines.append(f"{said[0].upper()}{said[1:]}.")
     if summary.row_0_from_truth:
         lines.append(
             f"Row 0 is not the initial box in {len(summary.row_0_from_truth)} of "
             f"{summary.sequences} sequences ({listed(summary.row_0_from_truth)}); there the trace "
             "starts from the truth, as the tracker did."
         )
+    lines += [f"Note: {each}." for each in summary.notes]
     if summary.without_truth:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:
         lines.append(f"Without results: {listed(summary.without_results)}.")
-    lines += [f"Note: {note}." for note in summary.notes]
     return "\n".join([*lines, f"Next: lae-sim replay {out}"])
 
 

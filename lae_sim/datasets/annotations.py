@@ -221,8 +221,7 @@ def read_truth(path: Path, frames: int | None = None) -> Floats:
     """
     lines = read_lines(path)
     if _VATIC.match(lines[0]):
-        boxes, _ = read_vatic(path, lines)
-        return boxes if frames is None else _of_frames(boxes, frames, path)
+        return read_vatic(path, lines, frames)[0]
     table = read_numbers(path, nan=True, absent=True, lines=lines)
     columns = table.shape[1]
     other = foreign_columns(table)
@@ -243,8 +242,29 @@ def read_truth(path: Path, frames: int | None = None) -> Floats:
     return np.concatenate([least, most - least], axis=1)
 
 
-def read_vatic(path: Path, lines: Sequence[str]) -> tuple[Floats, Bools]:
+def read_lost(path: Path, frames: int | None = None) -> Bools | None:
+    """Whether the target is lost, out of view, by an annotation file that says so: bool [T].
+
+    Args:
+        path, frames: as of :func:`read_truth`.
+
+    Returns:
+        None if the file is not of VATIC, and holds no such flags.
+
+    Raises:
+        LaeError: as :func:`read_truth`.
+    """
+    lines = read_lines(path)
+    return read_vatic(path, lines, frames)[1] if _VATIC.match(lines[0]) else None
+
+
+def read_vatic(path: Path, lines: Sequence[str], frames: int | None = None) -> tuple[Floats, Bools]:
     """One target that was annotated with VATIC.
+
+    Args:
+        path: the file.
+        lines: of it.
+        frames: see :func:`read_truth`.
 
     Returns:
         Boxes ``x, y, w, h`` in pixels, float64 [T, 4], a row of NaN = none; and whether the target
@@ -276,25 +296,13 @@ def read_vatic(path: Path, lines: Sequence[str]) -> tuple[Floats, Bools]:
     boxes, lost = np.full((at[-1] + 1, 4), np.nan), np.zeros(at[-1] + 1, bool)
     boxes[at] = np.concatenate([table[:, 1:3], table[:, 3:5] - table[:, 1:3]], axis=1)
     lost[at] = table[:, 6] == 1
+    if frames is None:
+        return boxes, lost
+    taken = _rows_of(len(lost), frames, path)
+    boxes, lost = boxes[taken], lost[taken]
+    if len(lost) == frames - 1:
+        boxes, lost = np.append(boxes, [[np.nan] * 4], axis=0), np.append(lost, False)
     return boxes, lost
-
-
-def read_lost(path: Path, frames: int) -> Bools | None:
-    """Whether the target is out of view, bool [frames], if that stands with the ground truth.
-
-    Args:
-        path: the annotation file.
-        frames: how many the sequence has.
-
-    Raises:
-        LaeError: as :func:`read_truth`.
-    """
-    lines = read_lines(path)
-    if not _VATIC.match(lines[0]):
-        return None
-    _, lost = read_vatic(path, lines)
-    flags: Bools = _of_frames(np.tile(lost[:, None], 4).astype(np.float64), frames, path)[:, 0] == 1
-    return flags
 
 
 def read_attributes(truth: GroundTruth) -> Attributes:
@@ -371,8 +379,8 @@ def _rate(file: Path) -> Fraction | None:
     return Fraction(folder.name)
 
 
-def _of_frames(boxes: Floats, frames: int, path: Path) -> Floats:
-    """NfS's truth of so many frames, if it fits but for the last one.
+def _rows_of(count: int, frames: int, path: Path) -> slice:
+    """Which of NfS's rows are the truth of so many frames, if it fits but for the last one.
 
     The files of 30 and of 240 frames/s are the same, and for the former every eighth row counts; so
     do the GOT-10k toolkit and others (https://github.com/got-10k/toolkit).
@@ -380,19 +388,17 @@ def _of_frames(boxes: Floats, frames: int, path: Path) -> Floats:
     Raises:
         LaeError: if what should have 30 frames/s has as many frames as the truth of 240.
     """
+    step = 1
     if _rate(path) == 30:
-        thinned = boxes[::_NFS_THINNED]
-        whole = path.parent.with_name("240") / path.name
-        if len(boxes) != frames and abs(len(thinned) - frames) <= 1:
-            boxes = thinned
-        elif abs(len(boxes) - frames) <= 1 and _is_same(path, whole):
+        thinned = -(-count // _NFS_THINNED)
+        if count != frames and abs(thinned - frames) <= 1:
+            step, count = _NFS_THINNED, thinned
+        elif abs(count - frames) <= 1 and _is_same(path, path.parent.with_name("240") / path.name):
             raise LaeError(
                 f"{path}: NfS's truth of 240 frames per second, and what has as many frames is of "
                 "240 too: --fps 240"
             )
-    if len(boxes) == frames - 1:
-        boxes = np.concatenate([boxes, np.full((1, 4), np.nan)])
-    return boxes[:frames] if len(boxes) == frames + 1 else boxes
+    return slice(0, frames * step if count == frames + 1 else None, step)
 
 
 def _is_same(file: Path, other: Path) -> bool:

@@ -17,6 +17,7 @@ from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.foreign import HEAD_BYTES, foreign
 from lae_sim.engine.clock import MAX_INT64, UNIT_NS
 from lae_sim.errors import LaeError
+from lae_sim.files import check_regular
 
 _MAX_BYTES = 1 << 28
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
@@ -175,6 +176,7 @@ def _number(cell: str) -> float:
 
 
 def _text(path: Path) -> str:
+    check_regular(path)
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise LaeError(f"{path}: too large for a table of numbers")

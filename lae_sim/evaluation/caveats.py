@@ -152,6 +152,12 @@ def notes_on(
             f"kalman-lae-pvt does not clip forecasts where the image size is unknown, as it is of "
             f"{unknown} of {len(sequences)} sequences"
         )
+    resized = [name for name in metadata.resized if name in set(sequences)]
+    if resized:
+        notes.append(
+            f"the images of {len(resized)} of {len(sequences)} sequences change size, such as "
+            f"those of {resized[0]!r}: clipping and search regions follow"
+        )
     for name, factory in forecasters.items():
         notes += [f"{name}: {note}" for note in notes_of(factory, sequences)]
     return notes

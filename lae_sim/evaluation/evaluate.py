@@ -21,7 +21,7 @@ from lae_sim.evaluation.scoring import Scored, Scorer
 from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run
 from lae_sim.trace.file import Trace
-from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.metadata import ImageSizes, Metadata
 from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
 
 Record = TypeVar("Record", "Staleness", "Curves")
@@ -528,21 +528,39 @@ def _answers_at(m: int, pairing: Pairing, part: PairedBoxes) -> Iterator[tuple[i
         yield int(sequence[begin]), Answers(source_frame[begin:end], answered[begin:end])
 
 
-def lanes_of(runs: Sequence[Run], pairing: Pairing, fed: Histories, image_sizes: Floats) -> Lanes:
+def lanes_of(
+    runs: Sequence[Run],
+    pairing: Pairing,
+    fed: Histories,
+    image_sizes: Sequence[ImageSizes | None],
+) -> Lanes:
     """What forecasters are fed in some histories of some runs.
 
     Args:
         runs: those that were paired.
         pairing: of their schedules.
         fed: histories of the pairing.
-        image_sizes: of each run, float64 [S, 2], infinite = unknown.
+        image_sizes: of each run; None = unknown.
     """
     boxes = np.concatenate([run.boxes for run in runs])
     numbers = pairing.frames.take(fed.output)
     frames = pairing.frame_times(np.repeat(fed.sequence, np.diff(fed.offsets)), numbers)
     fed_boxes = boxes.take(fed.output, axis=0)
-    sizes = image_sizes[fed.sequence]
-    return Lanes(fed.offsets, frames, fed_boxes, sizes, None if frames is numbers else numbers)
+    first = [(np.inf, np.inf) if sizes is None else sizes.at(0) for sizes in image_sizes]
+    resized: dict[int, ImageSizes] = {}
+    for s, sizes in enumerate(image_sizes):
+        if sizes is not None and sizes.change:
+            starts = pairing.frame_times(np.full(len(sizes.starts), s), np.array(sizes.starts))
+            timed = ImageSizes(tuple(starts.tolist()), sizes.sizes)
+            resized |= {int(lane): timed for lane in np.flatnonzero(fed.sequence == s)}
+    return Lanes(
+        fed.offsets,
+        frames,
+        fed_boxes,
+        np.array(first, np.float64)[fed.sequence],
+        None if frames is numbers else numbers,
+        resized,
+    )
 
 
 def _answers(
@@ -561,8 +579,7 @@ def _answers(
         raise LaeError(
             f"{name} sees frames when they arrive: not before, as sigma < 0 would have it"
         )
-    sizes = [metadata.image_size(run.recording.name) or (np.inf, np.inf) for run in runs]
-    image_sizes = np.array(sizes, np.float64)
+    image_sizes = [metadata.image_sizes(run.recording.name) for run in runs]
     with explained(name):
         factories = (
             [factory.for_sequence(run.recording) for run in runs]

@@ -32,8 +32,8 @@ box. A factory may have a second form for many sequences and permitted latencies
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from operator import index
 from typing import Any, Optional, Protocol, runtime_checkable
@@ -43,6 +43,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.engine.arrivals import FrameTime
 from lae_sim.errors import LaeError, explained
+from lae_sim.trace.metadata import ImageSizes
 
 ImageSize = Optional[tuple[int, int]]
 """Width and height of the images in pixels, or None if unknown."""
@@ -51,7 +52,8 @@ ImageSize = Optional[tuple[int, int]]
 class Forecaster(Protocol):
     """One target's motion, from the outputs so far; boxes are ``x, y, w, h`` in pixels.
 
-    Any class with these methods will do; it is made with the first box and the image size.
+    Any class with these methods will do; it is made with the first box and the image size. One that
+    also has ``resize(image_size)`` is told before anything else when images have another size.
 
     Example:
         >>> import lae_sim
@@ -82,6 +84,20 @@ class Forecaster(Protocol):
         """The box at a frame, from the boxes so far; may be asked many times, in any order."""
 
 
+@runtime_checkable
+class Resizable(Protocol):
+    """A forecaster that follows images which change size."""
+
+    def resize(self, image_size: ImageSize) -> None:
+        """What comes next is of images of this width and height, pixels."""
+
+
+def resize(forecaster: Forecaster, image_sizes: ImageSizes | None, frame: float) -> None:
+    """Tell a forecaster that follows it the size of a frame's image, if sizes change."""
+    if image_sizes is not None and image_sizes.change and isinstance(forecaster, Resizable):
+        forecaster.resize(image_sizes.at(frame))
+
+
 ForecasterFactory = Callable[[Sequence[float], ImageSize], Forecaster]
 """``factory(initial_box, image_size)`` makes the forecaster of one sequence."""
 
@@ -102,8 +118,9 @@ class Lanes:
         frames: frame of each item, int64 [N]; float64, their times in nominal frame intervals,
             where frames arrive at times of their own.
         boxes: box of each item, float64 [N, 4].
-        image_sizes: per lane, float64 [lanes, 2], infinite = unknown.
+        image_sizes: per lane, float64 [lanes, 2], infinite = unknown; of frame 0.
         numbers: the frames' numbers, int64 [N], where ``frames`` are times.
+        resized: of lanes whose images change size, all their sizes, by ``frames``.
     """
 
     offsets: Ints
@@ -111,6 +128,7 @@ class Lanes:
     boxes: Floats
     image_sizes: Floats
     numbers: Ints | None = None
+    resized: Mapping[int, ImageSizes] = field(default_factory=dict)
 
     def lane(self, item: Ints) -> Ints:
         """The lane of each item, int64 [P]."""
@@ -122,6 +140,21 @@ class Lanes:
         first: Ints = self.offsets[self.lane(item)]
         return first
 
+    def image_sizes_at(self, item: Ints, frame: Ints | Floats) -> Floats:
+        """Width and height of frames' images in the lanes of some items, float64 [P, 2].
+
+        Args:
+            item: int64 [P], not decreasing.
+            frame: int64 [P], or float64, as ``frames`` are.
+        """
+        lane = self.lane(item)
+        sizes: Floats = self.image_sizes[lane]
+        for k, changing in self.resized.items():
+            begin, end = np.searchsorted(lane, [k, k + 1])
+            which = np.searchsorted(changing.starts, frame[begin:end], "right") - 1
+            sizes[begin:end] = np.array(changing.sizes)[which]
+        return sizes
+
     def chosen(self, lanes: Bools, item: Ints) -> tuple[Lanes, Bools, Ints]:
         """Some of the lanes, by a mark for each: bool [lanes].
 
@@ -130,12 +163,14 @@ class Lanes:
         """
         sizes = np.diff(self.offsets)
         kept = np.repeat(lanes, sizes)
+        place = np.cumsum(lanes) - 1
         part = Lanes(
             np.concatenate([[0], np.cumsum(sizes[lanes])]),
             self.frames[kept],
             self.boxes[kept],
             self.image_sizes[lanes],
             None if self.numbers is None else self.numbers[kept],
+            {int(place[k]): sizes for k, sizes in self.resized.items() if lanes[k]},
         )
         inside = kept[item]
         return part, inside, (np.cumsum(kept) - 1)[item[inside]]
@@ -367,7 +402,9 @@ def _streamed(
             forecaster = factory(lanes.boxes[fed].tolist(), image_size)
         while fed < i:
             fed += 1
+            resize(forecaster, lanes.resized.get(k), fed_frames[fed])
             forecaster.update(fed_frames[fed], lanes.boxes[fed].tolist())
+        resize(forecaster, lanes.resized.get(k), asked[p])
         answer = forecaster.predict(asked[p])
         try:
             box = np.asarray(answer, np.float64)

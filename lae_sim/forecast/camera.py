@@ -34,6 +34,7 @@ from lae_sim.forecast.base import (
     ForecasterFactory,
     ImageSize,
     Lanes,
+    Resizable,
     Sequenced,
     factory_for,
     forecast,
@@ -371,6 +372,11 @@ class _Several:
         self._errors.append(_distance(predicted, np.array([box], np.float64)))
         for each in self._several:
             each.update(frame, box)
+
+    def resize(self, image_size: ImageSize) -> None:
+        for each in self._several:
+            if isinstance(each, Resizable):
+                each.resize(image_size)
 
     def predict(self, frame: int) -> Sequence[float]:
         best = int(np.argmin(sum(self._errors))) if self._errors else 0

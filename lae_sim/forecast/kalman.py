@@ -243,12 +243,16 @@ class KalmanLaePvt(Kalman):
     def __init__(self, box: Sequence[float], image_size: ImageSize = None) -> None:
         super().__init__(box, restart_iou=RESTART_IOU)
         self._raw = np.array([box], np.float64)
-        self._size = np.array([image_size or (np.inf, np.inf)], np.float64)
+        self.resize(image_size)
 
     def update(self, frame: int, box: Sequence[float]) -> None:
         """Take in the box of a newer frame."""
         self._raw = np.array([box], np.float64)
         super().update(frame, box)
+
+    def resize(self, image_size: ImageSize) -> None:
+        """The next forecast is clipped to this width and height."""
+        self._size = np.array([image_size or (np.inf, np.inf)], np.float64)
 
     def predict(self, frame: int) -> Sequence[float]:
         """The box at a frame, from the boxes so far."""
@@ -259,7 +263,7 @@ class KalmanLaePvt(Kalman):
     def forecast_lanes(lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once; equal bit for bit."""
         forecasts = PAPER.forecast_lanes(lanes, item, frame, RESTART_IOU)
-        return clip(forecasts, lanes.boxes[item], lanes.image_sizes[lanes.lane(item)])
+        return clip(forecasts, lanes.boxes[item], lanes.image_sizes_at(item, frame))
 
 
 def clip(forecasts: Floats, raw: Floats, image_sizes: Floats) -> Floats:

@@ -55,7 +55,7 @@ class Examples:
         pairing = pair([run.schedule for run in runs], [Fraction(0)])
         fed = histories(pairing)
         queries = pairs(pairing, fed)
-        lanes = lanes_of(runs, pairing, fed, np.full((len(runs), 2), np.inf))
+        lanes = lanes_of(runs, pairing, fed, [None] * len(runs))
         ends = np.cumsum(pairing.lengths)
         sequence = fed.sequence.take(lanes.lane(queries.item))
         row = (ends - pairing.lengths)[sequence] + queries.frame
@@ -73,13 +73,11 @@ class Examples:
         """The examples of some replays as one."""
         starts = np.cumsum([0, *(part.lanes.offsets[-1] for part in parts)])
         offsets = [part.lanes.offsets[:-1] + start for part, start in zip(parts, starts)]
-        lanes = Lanes(
-            np.concatenate([*offsets, starts[-1:]]),
-            *(
-                np.concatenate([getattr(part.lanes, name) for part in parts])
-                for name in ("frames", "boxes", "image_sizes")
-            ),
+        frames, boxes, sizes = (
+            np.concatenate([getattr(part.lanes, name) for part in parts])
+            for name in ("frames", "boxes", "image_sizes")
         )
+        lanes = Lanes(np.concatenate([*offsets, starts[-1:]]), frames, boxes, sizes)
         return cls(
             tuple(name for part in parts for name in part.sequences),
             lanes,

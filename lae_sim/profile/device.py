@@ -111,6 +111,7 @@ def _package(at: Path, name: str) -> str | None:
     return matched(text(at / "var/lib/dpkg/status"), installed)
 
 
+_CONTROL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f]")  # no trace may hold these
 CPU = "sys/devices/system/cpu"
 _SLOWDOWNS = {
     0x04: "software power cap",
@@ -154,7 +155,8 @@ def text(path: Path) -> str:
     except (OSError, ValueError):
         return ""
     # a sensor may answer "try again", as those of Jetson units that are off: Python gives None
-    return (data or b"").decode(errors="replace").strip("\0 \n\t")
+    plain = _CONTROL.sub(" ", (data or b"").decode(errors="replace"))
+    return plain.strip()
 
 
 def number(path: Path) -> int | None:

@@ -23,7 +23,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import latest, listed
 from lae_sim.engine.scheduler import Policy, Service, simulate
 from lae_sim.errors import LaeError, explained
-from lae_sim.forecast.base import AnyFactory, Forecaster, factory_for
+from lae_sim.forecast.base import AnyFactory, Forecaster, Resizable, factory_for
 from lae_sim.profile.timed import Answer, TimedTracker
 from lae_sim.replay.strides import phases
 from lae_sim.trace.recording import Recording
@@ -42,7 +42,7 @@ class LiveRun:
             are another device's.
         cpu_ns: CPU time of all calls together, ns.
         lost: processed frames where the tracker found nothing, int64 [k].
-        image_size: width and height, pixels.
+        image_sizes: width and height of the image of each, pixels, int64 [n, 2].
     """
 
     recording: Recording
@@ -50,7 +50,7 @@ class LiveRun:
     measured_ns: Ints
     cpu_ns: int
     lost: Ints
-    image_size: tuple[int, int]
+    image_sizes: Ints
 
 
 def run_real_time(
@@ -105,8 +105,9 @@ def run_every_frame(
         simulate(length, Clock.at(Fraction(1)), instantly, listed(frames.tolist()))
         runs.append(live.result(frames))
     whole, measured = runs[-1], np.zeros(length, np.int64)
+    sizes = np.zeros((length, 2), np.int64)
     for run in reversed(runs):  # of the phases that hold a frame, the first stands
-        measured[run.frames] = run.measured_ns
+        measured[run.frames], sizes[run.frames] = run.measured_ns, run.image_sizes
         for name in ("boxes", "elapsed_ns", "score"):
             getattr(whole.recording, name)[run.frames] = getattr(run.recording, name)[run.frames]
     return replace(
@@ -115,6 +116,7 @@ def run_every_frame(
         measured_ns=measured,
         cpu_ns=sum(run.cpu_ns for run in runs),
         lost=np.unique(np.concatenate([run.lost for run in runs])),
+        image_sizes=sizes,
     )
 
 
@@ -176,7 +178,7 @@ class Live:
         self._forecasting_ns = 0
         self._progress = progress
         self._last = -1
-        self._size = (0, 0)
+        self._sizes: list[tuple[int, int]] = []
         self._answers: list[Answer] = []
         self._elapsed_ns: list[int] = []
 
@@ -204,19 +206,21 @@ class Live:
         if self._pre_forecaster is not None:
             with explained("the pre-forecaster"):
                 factory = factory_for(self._pre_forecaster, self._sequence)
-                self._forecaster = factory(box, self._size)
+                self._forecaster = factory(box, self._sizes[-1])
         return self._tracker.init(image, box)
 
     def _track(self, frame: int, image: Image) -> Answer:
         if self._forecaster is None:
             return self._tracker.track(image)
         with explained("the pre-forecaster"):
+            if self._sizes[-1] != self._sizes[-2] and isinstance(self._forecaster, Resizable):
+                self._forecaster.resize(self._sizes[-1])
             before = perf_counter_ns()
             predicted = self._forecaster.predict(self.clock.frame_time(frame))
             spent = perf_counter_ns() - before
             if self._keep_size:
                 predicted = resized(predicted, self._last_box)
-            search = search_region(predicted, self._size)
+            search = search_region(predicted, self._sizes[-1])
         answer = self._tracker.track(image, search)
         if answer.box is not None:
             self._last_box = answer.box
@@ -230,19 +234,14 @@ class Live:
     def _check(self, frame: int, image: Image) -> None:
         checked_frame(image)
         size = image.shape[1], image.shape[0]
+        self._sizes.append(size)
         if frame == 0:
-            self._size = size
             x, y, w, h = self._sequence.truth[0]
             if x >= size[0] or y >= size[1] or x + w <= 0 or y + h <= 0:
                 raise LaeError(
                     f"the first box {_text(self._sequence.truth[0])} lies outside the "
                     f"{size[0]}x{size[1]} image"
                 )
-        elif size != self._size:
-            raise LaeError(
-                f"the image is {size[0]}x{size[1]}, and the first one "
-                f"{self._size[0]}x{self._size[1]}"
-            )
 
     def result(self, frames: Ints) -> LiveRun:
         """What was done, given the frames that were processed."""
@@ -263,13 +262,13 @@ class Live:
                 elapsed,
                 scores,
                 self._sequence.arrival_ns,
-                visible=self._sequence.visible,
+                self._sequence.visible,
             ),
             frames,
             np.array([answer.elapsed_ns for answer in self._answers], np.int64),
             sum(answer.cpu_ns for answer in self._answers),
             frames[[answer.box is None for answer in self._answers]],
-            self._size,
+            np.array(self._sizes, np.int64),
         )
 
 

@@ -21,7 +21,7 @@ from lae_sim.profile.live import Live, LiveRun
 from lae_sim.profile.timed import TimedTracker, TrackerError
 from lae_sim.replay.latency import by_frame, initialised
 from lae_sim.trace.file import Trace, read_trace, write_trace
-from lae_sim.trace.metadata import FORMAT, Metadata, version_of
+from lae_sim.trace.metadata import FORMAT, ImageSizes, Metadata, version_of
 from lae_sim.trace.recording import Recording
 
 READING_INTERVAL_S = 10.0
@@ -349,7 +349,7 @@ def _of_sequence(
     attributes = () if metadata.kind == "restarts" else sequence.attributes
     document["sequences"] = {
         run.recording.name: {
-            "image_size": list(run.image_size),
+            **ImageSizes.of(run.frames.tolist(), run.image_sizes.tolist()).entry(),
             **({"attributes": list(attributes)} if attributes else {}),
             "order": order,
             "lost": len(run.lost),

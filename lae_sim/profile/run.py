@@ -55,6 +55,7 @@ from lae_sim.replay.latency import time_label
 from lae_sim.replay.strides import phases
 from lae_sim.replay.world import flag, named, parse_policy, several, text
 from lae_sim.trace.file import check_replaces, read_trace
+from lae_sim.trace.metadata import text_fault
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -298,8 +299,11 @@ def run_profile(
             "remove it to profile anew"
         )
         return Profile((), ())
-    for note in dataset.notes:
-        notice(f"note: {note}")
+    for sequence in dataset.sequences:
+        if fault := text_fault(sequence.name):
+            raise LaeError(f"sequence {sequence.name!r}: the name {fault}: rename it")
+    for said in dataset.notes:
+        notice(said)
     failures: dict[str, list[Failure]] = {}
     interrupted = False
     with closing(_start(plan, notice)) as started:
@@ -344,6 +348,12 @@ def run_profile(
         raise KeyboardInterrupt
     if not written:
         raise LaeError("no sequence could be profiled")
+    resized = read_trace(written[0].path).metadata.resized
+    if resized:
+        notice(
+            f"note: the images of {len(resized)} sequences change size, such as those of "
+            f"{resized[0]!r}: the trace says from which frame on"
+        )
     return Profile(tuple(summary(task.path) for task in written), failed)
 
 

@@ -17,12 +17,12 @@ from lae_sim.engine.policies import latest
 from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
 from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError, explained, shown
-from lae_sim.forecast.base import ImageSize
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
 from lae_sim.replay.passes import split_passes
 from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
+from lae_sim.trace.metadata import ImageSizes
 from lae_sim.trace.recording import Recording, batched
 
 _GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
@@ -82,7 +82,7 @@ def replay_sequence(
     stride: Fraction = Fraction(1),
     strided: Mapping[Fraction, Recording] | None = None,
     search: SearchModel | None = None,
-    image_size: ImageSize = None,
+    image_size: tuple[int, int] | ImageSizes | None = None,
 ) -> Run:
     """Replay a recording under a latency source and a policy.
 
@@ -97,7 +97,8 @@ def replay_sequence(
         strided: recordings of every frame at other strides. The boxes are taken from the pass whose
             stride is nearest to the mean number of frames from one output to the next.
         search: the model of where the tracker finds its target; None for none.
-        image_size: width and height in pixels, if known, for the model's pre-forecaster.
+        image_size: width and height in pixels, if known, for the model's pre-forecaster; or all of
+            them, where images change size.
 
     Raises:
         LaeError: if a frame is asked for that the recording lacks, or the recordings differ in
@@ -116,6 +117,8 @@ def replay_sequence(
     if not isinstance(clock, Clock):
         raise LaeError(f"clock: such as Clock.at(trace.metadata.fps), not {shown(clock)}")
     times = recording if times is None else times
+    if isinstance(image_size, tuple):
+        image_size = ImageSizes.constant(image_size)
     job = _Job(recording, times, strided or {}, clock, stride, search, image_size)
     return job.run(simulate(len(recording), job.clock, source(job.times), policy))
 
@@ -130,7 +133,7 @@ class _Job:
     nominal: Clock
     stride: Fraction
     search: SearchModel | None = None
-    image_size: ImageSize = None
+    image_sizes: ImageSizes | None = None
 
     def __post_init__(self) -> None:
         for other in (self.times, *self.passes.values()):
@@ -182,10 +185,10 @@ class _Job:
         if self.passes:
             for other, weight in _beside(strides, frames).items():
                 recorded += phase_answers(other, passes[other], frames, weight)
-        times = None
+        sizes, times = self.image_sizes, None
         if not self.clock.is_even:
             times = [self.clock.frame_time(frame) for frame in frames.tolist()]
-        modelled = self.search.outcomes(self.recording, frames, recorded, self.image_size, times)
+        modelled = self.search.outcomes(self.recording, frames, recorded, sizes, times)
         return replace(run, modelled=modelled)
 
     @cached_property
@@ -359,7 +362,7 @@ class Runs:
                 self.clock,
                 self.trace.metadata.stride,
                 self.search,
-                self.trace.metadata.image_size(recording.name),
+                self.trace.metadata.image_sizes(recording.name),
             )
 
     def __repr__(self) -> str:

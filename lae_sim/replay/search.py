@@ -24,6 +24,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import lru_cache
 from math import ceil, inf, log
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou, resized, search_distance, search_region, search_side
 from lae_sim.errors import LaeError, explained, listed
-from lae_sim.forecast.base import AnyFactory, Forecaster, ImageSize, factory_for
+from lae_sim.forecast.base import AnyFactory, Forecaster, factory_for, resize
 from lae_sim.replay.reach import (
     FOUND_IOU,
     OwnJump,
@@ -43,7 +44,7 @@ from lae_sim.replay.reach import (
 )
 from lae_sim.replay.strides import phases
 from lae_sim.trace.file import Trace
-from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.metadata import ImageSizes, Metadata
 from lae_sim.trace.recording import Recording
 
 SEARCHES = "off, trace, c=0.7, c=0.6-1.0"
@@ -140,7 +141,7 @@ class SearchModel:
         recording: Recording,
         frames: Ints,
         recorded: Sequence[RecordedAnswers],
-        image_size: ImageSize = None,
+        image_sizes: ImageSizes | None = None,
         times: Sequence[Any] | None = None,
     ) -> Outcomes:
         """What a tracker of each likely reach would have answered.
@@ -150,7 +151,7 @@ class SearchModel:
             frames: processed frames, int64 [n].
             recorded: recorded answers for these frames: those that are replayed, and those of other
                 runs that are likely.
-            image_size: for the pre-forecaster.
+            image_sizes: for the pre-forecaster, if known.
             times: the frames as the pre-forecaster is given them (``Clock.frame_time``), where they
                 arrive at times of their own.
         """
@@ -164,7 +165,7 @@ class SearchModel:
         total = sum(answers.weight for answers in recorded)
         for answers in recorded:
             share = answers.weight / total
-            walk = self._walker(recording, asked, answers, resumed, image_size)
+            walk = self._walker(recording, asked, answers, resumed, image_sizes)
             for again, part in _AGAIN.items() if self.reach is not None else ((True, 1.0),):
                 each = share * part / (len(reaches) if self.known else 1)
                 same_to = -inf
@@ -189,7 +190,7 @@ class SearchModel:
         frames: Sequence[Any],
         answers: RecordedAnswers,
         resumed: tuple[int, bool],
-        image_size: ImageSize,
+        image_sizes: ImageSizes | None,
     ) -> Callable[[float, bool], tuple[Floats, Bools, float]]:
         """What makes a run of a reach, and of whether a lost target is found again.
 
@@ -202,9 +203,10 @@ class SearchModel:
 
         def walk(reach: float, again: bool) -> tuple[Floats, Bools, float]:
             with explained(f"sequence {recording.name!r}: the pre-forecaster"):
-                forecaster = factory(answers.boxes[0].tolist(), image_size)
+                first = None if image_sizes is None else image_sizes.at(0)
+                forecaster = factory(answers.boxes[0].tolist(), first)
                 return _forecast_walk(
-                    frames, answers, resumed, reach, again, forecaster, self.keep_size, image_size
+                    frames, answers, resumed, reach, again, forecaster, self.keep_size, image_sizes
                 )
 
         return walk
@@ -299,7 +301,7 @@ def _forecast_walk(
     again: bool,
     forecaster: Forecaster,
     keep_size: bool,
-    image_size: ImageSize,
+    image_sizes: ImageSizes | None,
 ) -> tuple[Floats, Bools, float]:
     """The run of a tracker that searches where a pre-forecaster says; every call is tested."""
     rows = answers.boxes.tolist()
@@ -307,10 +309,12 @@ def _forecast_walk(
     same_to = inf
     resumed_at, found = resumed
     for k, (frame, box) in enumerate(zip(frames[1:], rows[1:]), 1):
+        resize(forecaster, image_sizes, index(frame))
         predicted = forecaster.predict(frame)
         if keep_size:
             predicted = resized(predicted, answered[-1])
-        centre_x, centre_y, w, h = search_region(predicted, image_size)
+        size = None if image_sizes is None else image_sizes.at(index(frame))
+        centre_x, centre_y, w, h = search_region(predicted, size)
         missed = k < resumed_at or (lost[-1] and k > resumed_at and not again)
         if not missed and (k > resumed_at or not found):
             offset = max(abs(box[0] + box[2] / 2 - centre_x), abs(box[1] + box[3] / 2 - centre_y))

@@ -78,6 +78,20 @@ def draw_frame(
     return np.concatenate([np.asarray(picture, np.uint8), *bands])
 
 
+def fitted(picture: Image, height: int, width: int) -> Image:
+    """A picture in another size, as large as it fits, on black."""
+    import cv2
+
+    if picture.shape[:2] == (height, width):
+        return picture
+    scale = min(height / picture.shape[0], width / picture.shape[1])
+    across = min(max(round(picture.shape[1] * scale), 1), width)
+    down = min(max(round(picture.shape[0] * scale), 1), height)
+    filled = np.zeros((height, width, 3), np.uint8)
+    filled[:down, :across] = cv2.resize(picture, (across, down), interpolation=cv2.INTER_AREA)
+    return filled
+
+
 def film_strip(pictures: Sequence[Image], columns: int | None = None) -> Image:
     """Put pictures of one size side by side, row by row.
 
@@ -220,9 +234,7 @@ class Scene:
             writer = cv2.VideoWriter(str(temporary), fourcc, rate, (width, height))
             try:
                 for frame in trange(len(self.run), desc=Path(path).name, disable=None):
-                    picture = self.draw(frame)
-                    if picture.shape != first.shape:
-                        raise LaeError(f"{self.images.name!r}, frame {frame}: another image size")
+                    picture = fitted(self.draw(frame), *first.shape[:2])
                     writer.write(np.pad(picture, fill, "edge"))
             finally:
                 writer.release()
@@ -232,4 +244,5 @@ class Scene:
 
     def strip(self, frames: Sequence[int], width: int = 640) -> Image:
         """Pictures of some frames side by side, each ``width`` pixels wide."""
-        return film_strip([self.draw(frame, width) for frame in frames])
+        pictures = [self.draw(frame, width) for frame in frames]
+        return film_strip([fitted(picture, *pictures[0].shape[:2]) for picture in pictures])

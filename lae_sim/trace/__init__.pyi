@@ -1,9 +1,10 @@
 from .file import Trace, held, read_trace, validate, write_trace
 from .locate import find_traces
-from .metadata import Metadata
+from .metadata import ImageSizes, Metadata
 from .recording import Recording, batched
 
 __all__ = [
+    "ImageSizes",
     "Metadata",
     "Recording",
     "Trace",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any, NoReturn
 
 import numpy as np
@@ -11,6 +10,7 @@ from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import MOST_PIXELS, iou
 from lae_sim.errors import TraceError
 from lae_sim.trace.columns import BOX, TRUTH, Nullable, Rows
+from lae_sim.trace.metadata import text_fault
 from lae_sim.trace.recording import OPTIONAL_COLUMNS
 from lae_sim.trace.restarts import is_restart
 
@@ -27,7 +27,6 @@ OPTIONAL = (*TRUTH, "score", *OPTIONAL_COLUMNS)
 # No known tracker does 5,000 frames/s, so a shorter typical time is in another unit.
 _LEAST_TYPICAL_NS = 200_000
 _SAMPLE_ROWS = 10_000  # of each batch, to tell boxes from corners
-_SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 def check_schema(schema: Any, where: str) -> None:
@@ -107,9 +106,9 @@ class RowChecker:
     def _check_order(self, rows: Rows) -> None:
         first_frames = np.zeros(len(rows.names), np.int64)
         for run, name in enumerate(rows.names):
-            if not name or _SURROGATE.search(name):
-                problem = "the name is not Unicode text" if name else "the name is null or empty"
-                self._fail(rows, int(rows.starts[run]), "sequence", problem)
+            fault = text_fault(name) if name else "is null or empty"
+            if fault is not None:
+                self._fail(rows, int(rows.starts[run]), "sequence", f"the name {fault}")
             if self.restarts and not is_restart(name):
                 problem = "a restart is called SEQUENCE@START+GAP, such as 'car@12+6'"
                 self._fail(rows, int(rows.starts[run]), "sequence", problem)
@@ -166,6 +165,10 @@ class RowChecker:
                 if np.isfinite(value):
                     cause = "beyond any image"
                 self._fail(rows, row, columns[i], f"{value} is {cause}")
+        no_score = np.flatnonzero(~np.isfinite(rows.score) & ~rows.score_null)
+        if len(no_score):
+            row = int(no_score[0])
+            self._fail(rows, row, "score", f"{rows.score[row]}: a score is finite or null")
         negative = np.flatnonzero((rows.elapsed_ns < 0) & ~rows.elapsed_null)
         if len(negative):
             row = int(negative[0])

@@ -48,6 +48,7 @@ class Rows:
         elapsed_ns: int64 [n], -1 where null.
         elapsed_null: bool [n].
         score: float32 [n], NaN where null.
+        score_null: bool [n].
         arrival_ns: int64, None without that column.
         visible: bool, None without that column.
     """
@@ -62,6 +63,7 @@ class Rows:
     elapsed_ns: Ints
     elapsed_null: Bools
     score: npt.NDArray[np.float32]
+    score_null: Bools
     arrival_ns: Nullable | None = None
     visible: Nullable | None = None
 
@@ -73,6 +75,7 @@ class Rows:
         truth = np.concatenate([recording.truth for recording in recordings])
         boxes = np.concatenate([recording.boxes for recording in recordings])
         elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
+        score = np.concatenate([recording.score for recording in recordings])
         return cls(
             names=[recording.name for recording in recordings],
             starts=np.cumsum([0, *lengths]),
@@ -83,7 +86,8 @@ class Rows:
             box_null=np.isnan(boxes),
             elapsed_ns=elapsed,
             elapsed_null=elapsed == -1,
-            score=np.concatenate([recording.score for recording in recordings]),
+            score=score,
+            score_null=np.isnan(score),
             **{name: Nullable.of_recordings(name, recordings) for name in names},
         )
 
@@ -100,10 +104,10 @@ class Rows:
         truth, truth_null = _boxes(column, TRUTH, len(codes))
         boxes, box_null = _boxes(column, BOX, len(codes))
         elapsed_null = is_null(column["elapsed_ns"])
-        score = np.full(len(codes), np.nan, np.float32)
+        score, score_null = np.full(len(codes), np.nan, np.float32), np.ones(len(codes), np.bool_)
         if "score" in column:
-            scored = ~is_null(column["score"])
-            score[scored] = to_numpy(column["score"], np.float32)[scored]
+            score_null = is_null(column["score"])
+            score[~score_null] = to_numpy(column["score"], np.float32)[~score_null]
         return cls(
             names=[dictionary[code] for code in codes[starts[:-1]]],
             starts=starts,
@@ -115,6 +119,7 @@ class Rows:
             elapsed_ns=np.where(elapsed_null, -1, to_numpy(column["elapsed_ns"], np.int64)),
             elapsed_null=elapsed_null,
             score=score,
+            score_null=score_null,
             arrival_ns=_nullable(column.get("arrival_ns"), np.int64),
             visible=_nullable(column.get("visible"), np.bool_),
         )
@@ -131,7 +136,7 @@ class Rows:
             *(from_numpy(self.truth[:, i], ~self.truth_null[:, i]) for i in range(4)),
             *(from_numpy(self.boxes[:, i], ~self.box_null[:, i]) for i in range(4)),
             from_numpy(self.elapsed_ns, ~self.elapsed_null),
-            from_numpy(self.score, ~np.isnan(self.score)),
+            from_numpy(self.score, ~self.score_null),
         ]
         for name in schema.names[len(columns) :]:
             column: Nullable = getattr(self, name)

@@ -274,6 +274,7 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
 
     metadata = trace.metadata
     entries = metadata.document.get("sequences", {})
+    resized = frozenset(metadata.resized)
     sequences, frames, with_truth, sizes = [], 0, 0, Counter[str]()
     apart: list[float] = []
     for recording in trace:
@@ -283,7 +284,8 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
         if recording.arrival_ns is not None:
             apart.append(float(np.diff(recording.arrival_ns).max(initial=0)) / 1e6)
         size = metadata.image_size(recording.name)
-        sizes[f"{size[0]}x{size[1]}" if size else "unknown"] += 1
+        changing = " (changing)" if recording.name in resized else ""
+        sizes[f"{size[0]}x{size[1]}{changing}" if size else "unknown"] += 1
     order = {s.name: entries.get(s.name, {}).get("order") for s in sequences}
     ordered = all(isinstance(place, int) for place in order.values())
     if ordered:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lae_sim.errors import LaeError, TraceError
+from lae_sim.files import check_regular
 
 BLOCK = 8 << 20  # bytes read at once; s3fs would take 50 MiB, several times over
 
@@ -45,12 +46,17 @@ def opened(path: str) -> Iterator[Any]:
     """What pyarrow reads a trace from: a file, or of a URL one that can seek.
 
     Raises:
+        TraceError: if a path is that of no file.
         LaeError: if a URL cannot be opened.
         OSError, ValueError: if a file cannot be.
     """
     if not is_url(path):
         import pyarrow as pa
 
+        try:
+            check_regular(path)
+        except LaeError as error:
+            raise TraceError(str(error)) from error
         with pa.OSFile(os.fsencode(path)) as file:  # whose name need not be UTF-8
             yield file
         return
@@ -67,6 +73,7 @@ def digest(path: str) -> str:
         LaeError: if it cannot be read.
     """
     whole = hashlib.sha256()
+    check_regular(path)
     with _explained(path), _binary(path) if is_url(path) else open(path, "rb") as file:
         while block := file.read(BLOCK):
             whole.update(block)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -19,6 +20,7 @@ FORMAT = "lae-trace"
 VERSION = "1.0"
 NEWER_VERSION = "1.1"
 """Of traces with optional columns, and of restarts, whose kind readers of 1.0 do not know."""
+_UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 KINDS = ("every-frame", "real-time", "restarts")
 TRACES_TIMES = "the trace's times: "
 
@@ -37,6 +39,58 @@ class Search:
     half_side: float
     window: bool | None = None
     source: str | None = None
+
+
+@dataclass(frozen=True)
+class ImageSizes:
+    """The sizes of a sequence's images, of which most have one.
+
+    Attributes:
+        starts: the frames from which on images have another size, ascending; the first is 0. (In
+            the lanes of forecasters they are times where frames are.)
+        sizes: width and height from then on, pixels.
+
+    Example:
+        >>> from lae_sim.trace import ImageSizes
+        >>> sizes = ImageSizes.of([0, 2, 5, 6], [(640, 360), (640, 360), (320, 180), (320, 180)])
+        >>> sizes.at(4), sizes.at(5), sizes.change
+        ((640, 360), (320, 180), True)
+    """
+
+    starts: tuple[float, ...]
+    sizes: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, frames: Iterable[int], sizes: Iterable[Sequence[int]]) -> ImageSizes:
+        """Those of some frames, ascending from 0, as they were seen there."""
+        starts: list[int] = []
+        of_starts: list[tuple[int, int]] = []
+        for frame, (width, height) in zip(frames, sizes):
+            if of_starts[-1:] != [(width, height)]:
+                starts.append(int(frame))
+                of_starts.append((int(width), int(height)))
+        return cls(tuple(starts), tuple(of_starts))
+
+    @classmethod
+    def constant(cls, size: tuple[int, int]) -> ImageSizes:
+        """The same in all frames."""
+        return cls((0,), (size,))
+
+    @property
+    def change(self) -> bool:
+        """Whether there are several."""
+        return len(self.sizes) > 1
+
+    def at(self, frame: float) -> tuple[int, int]:
+        """Width and height of a frame's image, pixels."""
+        return self.sizes[bisect_right(self.starts, frame) - 1]
+
+    def entry(self) -> dict[str, list[Any]]:
+        """What the metadata of a sequence says of them."""
+        entry: dict[str, list[Any]] = {"image_size": list(self.sizes[0])}
+        if self.change:
+            entry["image_sizes"] = [[at, *size] for at, size in zip(self.starts, self.sizes)]
+        return entry
 
 
 @dataclass(frozen=True, repr=False)
@@ -197,9 +251,23 @@ class Metadata:
         return any(entry.get("attributes") for entry in self.document.get("sequences", {}).values())
 
     def image_size(self, sequence: str) -> tuple[int, int] | None:
-        """Width and height of the sequence's images in pixels, if known."""
+        """Width and height of the sequence's images in pixels, if known; of the first one."""
         size = self._sequence(sequence).get("image_size")
         return None if size is None else (size[0], size[1])
+
+    def image_sizes(self, sequence: str) -> ImageSizes | None:
+        """The sizes of the sequence's images, if known."""
+        several = self._sequence(sequence).get("image_sizes")
+        if several:
+            return ImageSizes.of((each[0] for each in several), (each[1:] for each in several))
+        size = self.image_size(sequence)
+        return None if size is None else ImageSizes.constant(size)
+
+    @property
+    def resized(self) -> list[str]:
+        """The sequences whose images change size."""
+        entries = self.document.get("sequences", {}).items()
+        return [name for name, entry in entries if len(entry.get("image_sizes", ())) > 1]
 
     def attributes(self, sequence: str) -> tuple[str, ...]:
         """The dataset's attributes of the sequence, such as ``"Occlusion"``."""
@@ -213,6 +281,30 @@ class Metadata:
 def version_of(kind: str) -> str:
     """The oldest version of the format whose readers know a trace of this kind."""
     return NEWER_VERSION if kind == "restarts" else VERSION
+
+
+def text_fault(text: str) -> str | None:
+    """Why a text may not be in a trace; None if it may."""
+    found = _UNFIT.search(text)
+    if found is None:
+        return None
+    if found[0] >= "\ud800":
+        return f"is not Unicode text: it holds {found[0]!r}, half of a character"
+    return f"holds the control character {found[0]!r}"
+
+
+def _check_texts(document: Mapping[str, Any]) -> None:
+    """Check every key and text, however deep."""
+    left: list[tuple[str, Any]] = [(key, (key, value)) for key, value in document.items()]
+    while left:
+        where, value = left.pop()
+        if isinstance(value, str):
+            if fault := text_fault(value):
+                raise TraceError(f"metadata key {where[:200]!r} {fault}")
+        elif isinstance(value, dict):
+            left += [(f"{where}.{key}", (key, inner)) for key, inner in value.items()]
+        elif isinstance(value, (list, tuple)):  # a tuple is a key and its value
+            left += [(where, inner) for inner in value]
 
 
 def _finite(text: str) -> float:
@@ -252,7 +344,8 @@ def _kind(document: Mapping[str, Any]) -> str:
 
 
 def _checked(document: dict[str, Any]) -> dict[str, Any]:
-    """Check the types of the optional keys that lae_sim reads."""
+    """Check all texts, and the types of the optional keys that lae_sim reads."""
+    _check_texts(document)
     for key in ("tracker", "device", "timing", "sequences"):
         if not isinstance(document.get(key, {}), dict):
             raise TraceError(f"metadata key {key!r} must be a JSON object")
@@ -262,16 +355,32 @@ def _checked(document: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(entry, dict):
             raise TraceError(f"{where} must be a JSON object")
         size = entry.get("image_size")
-        if size is not None and not (
-            isinstance(size, list)
-            and len(size) == 2
-            and all(type(side) is int and 0 < side < 2**31 for side in size)
-        ):
+        if size is not None and not _is_size(size):
             raise TraceError(f"{where}: 'image_size' must be [width, height] in pixels")
+        if "image_sizes" in entry and not _are_sizes(entry["image_sizes"], size):
+            raise TraceError(
+                f"{where}: 'image_sizes' must be a list of [frame, width, height], frames "
+                "ascending from 0, where it is 'image_size'"
+            )
         attributes = entry.get("attributes", [])
         if not (isinstance(attributes, list) and all(isinstance(a, str) for a in attributes)):
             raise TraceError(f"{where}: 'attributes' must be a list of names")
     return document
+
+
+def _is_size(size: Any) -> bool:
+    whole = isinstance(size, list) and all(type(side) is int for side in size)
+    return whole and len(size) == 2 and all(0 < side < 2**31 for side in size)
+
+
+def _are_sizes(sizes: Any, first: Any) -> bool:
+    if not (isinstance(sizes, list) and all(isinstance(each, list) and each for each in sizes)):
+        return False
+    frames = [each[0] for each in sizes]
+    if not all(type(frame) is int and frame < 2**31 for frame in frames):
+        return False
+    ascending = frames[:1] == [0] and sorted(set(frames)) == frames
+    return ascending and all(_is_size(each[1:]) for each in sizes) and sizes[0][1:] == first
 
 
 def _check_search(search: Any) -> None:

@@ -122,15 +122,21 @@ class OpenCv:
         """The target's box in the next frame, with a score if the tracker has one, or None.
 
         Raises:
-            LaeError: if ``init`` was not called, or the frame is not of the first one's size.
+            LaeError: if ``init`` was not called, or the tracker cannot go on where frames change
+                size (MedianFlow and TLD).
         """
         if self._tracker is None:  # OpenCV would end the process
             raise LaeError(f"opencv:{self._name}: init must come before track")
         frame = checked_frame(frame)
-        if frame.shape != self._shape:
+        try:
+            found, box = self._tracker.update(frame)
+        except cv2.error as error:
+            if frame.shape == self._shape:
+                raise
             sizes = " to ".join(f"{s[1]} x {s[0]}" for s in (self._shape, frame.shape))
-            raise LaeError(f"opencv:{self._name}: the frames change from {sizes} pixels")
-        found, box = self._tracker.update(frame)
+            raise LaeError(
+                f"opencv:{self._name} cannot go on where frames change from {sizes} pixels"
+            ) from error
         if not found:
             return None
         score = getattr(self._tracker, "getTrackingScore", float)()

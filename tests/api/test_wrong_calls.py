@@ -342,7 +342,7 @@ def test_worlds(fields: dict[str, Any], message: str) -> None:
         (lambda t: lae_sim.read_trace("x.parquet"), "x.parquet: no such file"),
         (lambda t: lae_sim.read_trace(3), "path: a trace is read from a path or a URL, not 3"),
         (lambda t: lae_sim.read_trace([SLOW]), "path: a trace is read from a path"),
-        (lambda t: lae_sim.read_trace(str(TRACES)), "not a readable Parquet file"),
+        (lambda t: lae_sim.read_trace(str(TRACES)), "a folder, not a file"),
         (lambda t: lae_sim.read_trace(SLOW, "nowhere"), "no sequence 'nowhere'"),
         (lambda t: lae_sim.read_trace(SLOW, [3]), "sequences: a sequence is named by text"),
         (lambda t: t["nowhere"], "no sequence 'nowhere'"),

@@ -88,6 +88,7 @@ def test_json(world, convert):
         "processed": 6,
         "median_ms": 20.0000005,
         "frame_times": None,
+        "numbers_missing": [],
         "row_0_from_truth": [],
         "without_truth": [],
         "without_results": [],

@@ -128,15 +128,23 @@ def test_a_film_appears_whole_or_not_at_all(scene: Scene, tmp_path: Path) -> Non
             raise LaeError("frame 7 is damaged")
         return read(frame)
 
-    def grows(frame: int) -> np.ndarray:
-        return read(frame)[: 301 - (frame == 7)]
+    broken = Scene(scene.run, ImageSequence("ball", TRUTH, breaks), scene.answers)
+    with pytest.raises(LaeError, match="damaged"):
+        broken.film(tmp_path / "film.mp4")
+    assert not list(tmp_path.iterdir())
 
-    for reader, message in [(breaks, "damaged"), (grows, "frame 7: another image size")]:
-        images = ImageSequence("ball", TRUTH, reader)
-        broken = Scene(scene.run, images, scene.answers)
-        with pytest.raises(LaeError, match=message):
-            broken.film(tmp_path / "film.mp4")
-        assert not list(tmp_path.iterdir())
+
+def test_images_that_change_size_are_fitted_into_the_first(scene: Scene, tmp_path: Path) -> None:
+    def shrinks(frame: int) -> np.ndarray:
+        return np.full((301, 641, 3), 90, np.uint8)[: 100 if frame >= 7 else None]
+
+    smaller = Scene(scene.run, ImageSequence("ball", TRUTH, shrinks), scene.answers)
+    smaller.film(tmp_path / "film.mp4")
+    frames = frames_of(tmp_path / "film.mp4")
+    assert len(frames) == T
+    assert len({frame.shape for frame in frames}) == 1
+    strip = smaller.strip([0, 9], width=320)
+    assert strip.shape[1] >= 2 * 320 or strip.shape[0] >= 2 * scene.draw(0, 320).shape[0]
 
 
 def test_a_full_disk(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -201,7 +201,7 @@ def test_traces_that_do_not_go_together_are_told(tmp_path: Path) -> None:
     strange = every_frame(tmp_path / "s.parquet", tracker={"name": "strange"})
     closed = closed_loop(tmp_path / "c.parquet", constant(60))
     for traces, passes, message in (
-        ([every, again], (), r"t.parquet and .*u.parquet are of its tracker .*give one"),
+        ([every, again], (), r"t.parquet, .*u.parquet are of its tracker .*give one"),
         ([other, strange], (), "c.parquet: none of the traces"),
         ([every, other], [strange], "s.parquet: none of the traces"),
         (every, [strange], "tracker.name is 'strange'.*same tracker"),

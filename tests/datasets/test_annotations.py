@@ -8,6 +8,7 @@ from lae_sim.datasets.annotations import (
     Attributes,
     find_truth,
     read_attributes,
+    read_lost,
     read_truth,
     read_vatic,
 )
@@ -153,6 +154,9 @@ def test_nfs_of_30_frames_per_second_is_every_eighth_row(tmp_path):
     one_more = read_truth(slow, 4)
     assert one_more[:3].tolist() == [WAY[0], WAY[8], WAY[16]]
     assert np.isnan(one_more[3]).all()
+    make(tmp_path, "c/30/c.txt", text=vatic(WAY, lost=(8, 9)))
+    assert read_lost(tmp_path / "c/30/c.txt", 4).tolist() == [False, True, False, False]
+    assert read_lost(make(tmp_path, "d.txt") / "d.txt", 2) is None
     with pytest.raises(LaeError, match="is of 240 too: --fps 240"):
         read_truth(slow, 17)
     make(tmp_path, "b/30/b.txt", text=vatic(WAY[::8]))  # as somebody thinned it out

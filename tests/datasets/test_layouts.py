@@ -76,16 +76,17 @@ def test_layouts_are_recognised(tmp_path, folder, pattern, file, name):
 
 
 def test_nfs_as_it_is_downloaded(tmp_path):
-    row = '0 1 2 4 6 {} 0 0 1 "ball"\n'
+    row = '0 1 2 4 6 {} {} 0 1 "ball"\n'
     for rate, count in ((30, 2), (240, 16)):
         images(tmp_path / "NfS" / "ball" / str(rate) / "ball", "%05d.jpg", range(1, count + 1))
         path = tmp_path / "NfS" / "ball" / str(rate) / "ball.txt"
-        path.write_text("".join(row.format(k) for k in range(1, 17)))
+        path.write_text("".join(row.format(k, int(k > 8)) for k in range(1, 17)))
         dataset = find_dataset(root=tmp_path / "NfS", fps=rate)
         (ball,) = dataset.sequences
         assert (dataset.name, dataset.fps, ball.name) == ("NfS", rate, "ball")
         assert ball.truth.tolist() == [[1, 2, 3, 4]] * count
         assert levels(ball) == [1, count]
+        assert ball.visible.tolist() == [True] * (count // 2) + [False] * (count // 2)
     with pytest.raises(LaeError, match="--fps 30 or --fps 240"):
         find_dataset(root=tmp_path / "NfS")
 

@@ -89,7 +89,7 @@ def test_no_table(written, text, problem):
 def test_no_file(tmp_path):
     with pytest.raises(LaeError, match="no such file"):
         read_numbers(tmp_path / "none.txt")
-    with pytest.raises(LaeError, match="cannot be read"):
+    with pytest.raises(LaeError, match="a folder, not a file"):
         read_numbers(tmp_path)
 
 

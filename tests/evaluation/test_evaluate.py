@@ -51,7 +51,7 @@ from lae_sim.replay.latency import LatencySource, by_frame, constant, initialise
 from lae_sim.replay.run import Run, replay_sequence
 from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.metadata import ImageSizes, Metadata
 from lae_sim.trace.recording import Recording
 
 CLOCK = Clock.at(Fraction(30))
@@ -265,6 +265,27 @@ def test_kalman_lae_pvt_agrees_with_matrices_through_answers() -> None:
             np.testing.assert_allclose(told.boxes, expected, rtol=0, atol=1e-7)
     assert DenseLaePvt.hits["clipped"] > 100
     assert DenseLaePvt.hits["update"] > 100
+
+
+def test_forecasts_are_clipped_to_images_that_change_size() -> None:
+    boxes = np.array([[100.0 + 8 * i, 40, 40, 30] for i in range(30)])
+    recording = Recording.new("b", boxes, boxes, np.full(30, 90_000_000))
+    other = Recording.new("a", boxes, boxes, np.full(30, 90_000_000))
+    sizes = ImageSizes((0, 12, 20), ((640, 360), (250, 90), (640, 360)))
+    metadata = Metadata.new("30", "every-frame", sequences={"b": sizes.entry()})
+    runs = [replay_sequence(each, CLOCK) for each in (other, recording)]
+    freely, clipped = (answers(run, metadata, "kalman-lae-pvt", KalmanLaePvt).boxes for run in runs)
+    inside = slice(12, 20)
+    expected = freely.copy()
+    expected[inside, 2] = np.minimum(freely[inside, 0] + freely[inside, 2], 250) - freely[inside, 0]
+    kept = expected[:, 2] > 3  # where too little is left, the raw box answers
+    assert kept[:12].all()
+    assert 1 <= kept[inside].sum() < 8
+    np.testing.assert_allclose(clipped[kept], expected[kept], atol=1e-9)
+    forecasters = {"kalman-lae-pvt": KalmanLaePvt}
+    found = evaluate_runs(runs, metadata, forecasters)
+    notes = notes_on(found.replay, metadata, PYSOT, forecasters)
+    assert any("images of 1 of 2 sequences change size, such as those of 'b'" in n for n in notes)
 
 
 def test_the_initial_box_answers_until_the_first_output_is_fed() -> None:

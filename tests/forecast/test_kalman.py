@@ -26,6 +26,7 @@ from lae_sim.forecast.kalman import (
     clip,
     filter_lanes,
 )
+from lae_sim.trace.metadata import ImageSizes
 
 BOXES = st.tuples(*[st.floats(-1000, 3000)] * 2, *[st.floats(0.5, 900)] * 2)
 
@@ -192,6 +193,23 @@ def test_image_sizes_are_per_lane() -> None:
     lanes = np.array([[100, 100], [np.inf, np.inf], [120, 30]], float)
     found = clip(np.array([box] * 3), np.array([box] * 3), lanes)
     assert found.tolist() == [[90, 10, 10, 40], box, [90, 10, 30, 20]]
+
+
+def test_clipping_follows_images_that_change_size() -> None:
+    box = [90.0, 10.0, 40.0, 40.0]
+    sizes = ImageSizes((0, 2, 5), ((120, 90), (110, 30), (900, 900)))
+    lanes = Lanes(
+        np.array([0, 1, 2]), np.array([0, 0]), np.array([box] * 2), np.array([[120, 90.0]] * 2),
+        resized=        {1: sizes},
+    )  # fmt: skip
+    item, frame = np.array([0, 0, 1, 1, 1, 1]), np.array([0, 6, 1, 2, 4, 5])
+    whole, narrow = [90, 10, 30, 40], [90, 10, 20, 20]
+    expected = [whole, whole, whole, narrow, narrow, box]
+    assert KalmanLaePvt.forecast_lanes(lanes, item, frame).tolist() == expected
+    assert streaming(KalmanLaePvt, lanes, item, frame).tolist() == expected
+    part, inside, moved = lanes.chosen(np.array([False, True]), item)
+    assert part.resized == {0: sizes}
+    assert KalmanLaePvt.forecast_lanes(part, moved, frame[inside]).tolist() == expected[2:]
 
 
 def test_lanes_of_any_order_of_lengths_do_not_mix() -> None:

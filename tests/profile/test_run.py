@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from lae_sim.api.evaluation import evaluate
 from lae_sim.comparison.fidelity import compare_closed_loops, summarise_closed_loops
 from lae_sim.errors import LaeError
 from lae_sim.profile.passes import Failure
@@ -122,6 +124,27 @@ def test_a_profile_shows_its_progress_and_says_what_to_know(
     assert repr(again) == "<Profile: nothing was left to do>"
 
 
+def test_images_that_change_size(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2", reason="frames are decoded with OpenCV")
+    folder = tmp_path / "data" / "car"
+    (folder / "img").mkdir(parents=True)
+    for frame in range(9):
+        width, height = (160, 120) if frame < 5 else (100, 90)
+        image = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+        cv2.imwrite(str(folder / "img" / f"{frame}.png"), image[:height, :width])
+    (folder / "groundtruth_rect.txt").write_text("40,30,30,20\n" * 9)
+    notes: list[str] = []
+    plan = ProfilePlan.of(tracker="dcf", root=tmp_path / "data", in_process=True, strides=[2])
+    profile = run_profile(plan, tmp_path / "dcf.parquet", notice=notes.append)
+    assert "images of 1 sequences change size, such as those of 'car'" in notes[-1]
+    for summary in profile.traces:
+        entry = read_trace(summary.trace).metadata.document["sequences"]["car"]
+        assert entry["image_size"] == [160, 120]
+        assert entry["image_sizes"] == [[0, 160, 120], [5, 100, 90]]
+    result = evaluate(tmp_path / "dcf.parquet", forecasters="kalman-lae-pvt")
+    assert any("images of 1 of 1 sequences change size" in note for note in result.notes)
+
+
 def test_a_failure_shows_in_html_as_text() -> None:
     failed = Profile((), (Failure("<b>", "<script>"),))
     assert "<script>" not in failed._repr_html_()
@@ -160,3 +183,43 @@ def test_flags_of_absence_are_profiled(tmp_path: Path, monkeypatch: pytest.Monke
         assert (a.visible, c.visible) == (None, None)
         assert b.visible is not None
         assert b.visible.tolist() == [True, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("said", "problem"),
+    [
+        ("{'settings': {'lr': float('nan')}}", "NaN is not JSON"),
+        ("{'settings': {'lr': float('-inf')}}", "-Infinity is not JSON"),
+        ("{'version': '1.0\\x1b[2J'}", "'tracker.version' holds the control character"),
+    ],
+)
+def test_what_a_tracker_says_of_itself_must_fit_a_trace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str, problem: str
+) -> None:
+    (tmp_path / "odd.py").write_text(
+        "class Odd:\n"
+        "    def init(self, frame, box):\n"
+        "        pass\n"
+        "    def track(self, frame):\n"
+        "        return [1, 2, 3, 4]\n"
+        "    def describe(self):\n"
+        f"        return {said}\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "odd", raising=False)
+    with pytest.raises(LaeError, match=r"^odd:Odd: what describe\(\) says") as caught:
+        run_profile(ProfilePlan.of(tracker="odd:Odd", **QUICK), tmp_path / "t.parquet")
+    assert problem in str(caught.value)
+    assert sorted(path.name for path in tmp_path.glob("t.*")) == []
+
+
+def test_a_sequence_that_no_trace_can_name_is_refused_before_anything_is_run(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "data" / "a\x1b[2J"
+    (folder / "img").mkdir(parents=True)
+    cv2.imwrite(str(folder / "img" / "1.png"), np.zeros((40, 60, 3), np.uint8))
+    (folder / "groundtruth.txt").write_text("10,10,20,20\n")
+    plan = ProfilePlan.of(root=tmp_path / "data", in_process=True)
+    with pytest.raises(LaeError, match=r"the name holds the control character .*: rename it"):
+        run_profile(plan, tmp_path / "t.parquet")

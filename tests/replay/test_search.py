@@ -16,6 +16,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import latest
 from lae_sim.engine.scheduler import simulate
 from lae_sim.errors import LaeError
+from lae_sim.forecast.base import ConstantVelocity
 from lae_sim.forecast.kalman import Kalman
 from lae_sim.replay.latency import constant
 from lae_sim.replay.reach import OwnJump, Reach
@@ -29,7 +30,7 @@ from lae_sim.replay.search import (
 )
 from lae_sim.replay.strides import phases
 from lae_sim.trace.file import Trace
-from lae_sim.trace.metadata import Metadata
+from lae_sim.trace.metadata import ImageSizes, Metadata
 from lae_sim.trace.recording import Recording
 
 CLOCK = Clock.at(Fraction(30))
@@ -119,6 +120,23 @@ def test_a_pre_forecaster_says_where_to_search(walk, c, keep_size):
     found = ahead.outcomes(recording, frames, recorded(recording, frames))
     expected = plain_forecast(frames, recording.boxes[frames], c, keep_size)
     np.testing.assert_allclose(found.boxes[0], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_search_regions_follow_images_that_change_size():
+    boxes = np.column_stack([100 + 8.0 * np.arange(20), *np.full((3, 20), 40.0)])
+    recording, frames = Recording.new("a", boxes, boxes, np.full(20, 10**6)), np.arange(0, 20, 2)
+    ahead = model(0, pre_forecaster=ConstantVelocity)  # never found: it answers where it searches
+    sizes = ImageSizes((0, 8), ((640, 360), (90, 50)))
+    (free,) = ahead.outcomes(recording, frames, recorded(recording, frames)).boxes
+    (found,) = ahead.outcomes(recording, frames, recorded(recording, frames), sizes).boxes
+    small = frames >= 8
+    assert free.tolist() == [[100, 40, 40, 40]] * 10
+    assert found[~small].tolist() == free[~small].tolist()
+    assert found[small][0].tolist() == [70, 30, 40, 40]  # the centre at the new image's corner
+    run = replay_sequence(recording, CLOCK, constant(ns=47_000_000), search=ahead, image_size=sizes)
+    first_small = int(np.argmax(run.schedule.frames >= 8))
+    assert run.modelled.likeliest[first_small - 1].tolist() == [100, 40, 40, 40]
+    assert run.modelled.likeliest[first_small].tolist() == [70, 30, 40, 40]
 
 
 def test_a_pre_forecaster_that_fails_is_named():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,11 @@ from witness import BOX, MINIMAL, TRUTH, columns_of, moving, write_plain
 import lae_sim.trace.file
 from lae_sim.errors import TraceError
 from lae_sim.trace.file import Trace, read_trace, validate, write_trace
+from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
 Columns = dict[str, list[Any]]
+EVERY = Metadata.new("30", "every-frame")
 GROUP = [moving(20, 1, "Car1"), moving(20, 2, "Gull2")]
 ROW, FRAME = 25, 5  # row 25 is frame 5 of Gull2
 
@@ -104,6 +107,9 @@ FAULTS = [
     (put("truth_w", -math.inf), "truth_w", "Gull2", 5, "-inf is not a number"),
     (put("elapsed_ns", -1), "elapsed_ns", "Gull2", 5, "negative time -1 ns"),
     (put("elapsed_ns", -(2**63)), "elapsed_ns", "Gull2", 5, "negative time"),
+    (put("score", math.inf), "score", "Gull2", 5, "inf: a score is finite or null"),
+    (put("score", -math.inf), "score", "Gull2", 5, "-inf: a score is finite or null"),
+    (put("score", math.nan), "score", "Gull2", 5, "nan: a score is finite or null"),
 ]
 
 
@@ -126,6 +132,33 @@ def test_a_fault_is_named(
     where = f"faulty.parquet: column '{column}', sequence '{sequence}', frame {frame}: .*"
     with pytest.raises(TraceError, match=where + f"({cause})"):
         validate(path)
+
+
+UNFIT = ["\0", "\t", "\n", "\r", "\x1b", "\x7f", "\x85"]
+
+
+@pytest.mark.parametrize("character", UNFIT)
+def test_a_name_has_no_control_characters(tmp_path: Path, character: str) -> None:
+    name = f"Gull2{character}[2J"
+    path = write_plain(tmp_path / "faulty.parquet", columns_of([moving(3, 0, name)]))
+    message = re.escape(f"the name holds the control character {character!r}")
+    for attempt in (validate, lambda path: write_trace(Trace(EVERY, [moving(3, 0, name)]), path)):
+        with pytest.raises(TraceError, match=message) as caught:
+            attempt(path)
+        assert str(caught.value).isprintable()
+
+
+def test_a_name_is_unicode(tmp_path: Path) -> None:
+    with pytest.raises(TraceError, match="the name is not Unicode text"):
+        write_trace(Trace(EVERY, [moving(3, 0, "Gull2\udcff")]), tmp_path / "faulty.parquet")
+
+
+def test_an_infinite_score_is_not_written(tmp_path: Path) -> None:
+    recording = moving(3, 0, "a")
+    recording.score[2] = np.inf
+    with pytest.raises(TraceError, match="'a', frame 2: inf: a score is finite or null"):
+        write_trace(Trace(EVERY, [recording]), tmp_path / "faulty.parquet")
+    assert not (tmp_path / "faulty.parquet").exists()
 
 
 NEWER = {**MINIMAL, "version": "1.1"}

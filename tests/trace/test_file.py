@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from witness import BOX, MINIMAL, TRUTH, TYPES, assert_same, columns_of, moving,
 import lae_sim.trace.file
 from lae_sim.errors import LaeError, TraceError
 from lae_sim.trace.file import Trace, read_trace, validate, write_trace
+from lae_sim.trace.locate import digest
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording, batched
 
@@ -46,8 +48,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def group() -> list[Recording]:
     """Sequences of several lengths, sorted by name; also names that need care."""
-    names = ["", "A b", "Z", "a", "a\0b", "a\nb", "aa", "../x", "é", "\U0001f600", "x" * 3000]
-    names = sorted(name for name in names if name)
+    names = sorted(["A b", "Z", "a", "a'b", "aa", "../x", "é", "\u202e", "\U0001f600", "x" * 3000])
     return [sparse(1 + 7 * i, i, name) for i, name in enumerate(names)]
 
 
@@ -357,7 +358,7 @@ def test_times_as_fractions_are_guessed_to_be_seconds(path: Path, kind: pa.DataT
 
 
 def test_unknown_metadata_keys_are_kept(path: Path) -> None:
-    more = {"mine": {"deep": [1, 2.5, None, "é\ud800", True]}, "big": 2**70, "": 0}
+    more = {"mine": {"deep": [1, 2.5, None, "é\u2028", True]}, "big": 2**70, "": 0}
     metadata = Metadata.parse(write_and_dump(path, {**MINIMAL, **more}))
     assert {k: metadata.document[k] for k in more} == more
     write_trace(Trace(metadata, [moving(3)]), path)
@@ -387,8 +388,22 @@ def test_a_file_that_is_not_parquet(path: Path, content: bytes) -> None:
 
 
 def test_a_folder_is_not_a_trace(tmp_path: Path) -> None:
-    with pytest.raises(TraceError, match="not a readable Parquet file"):
+    with pytest.raises(TraceError, match="a folder, not a file"):
         read_trace(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes")
+def test_a_pipe_is_refused_at_once(tmp_path: Path) -> None:
+    """Opening it would wait for a writer for ever."""
+    os.mkfifo(tmp_path / "pipe.parquet")
+    os.symlink("pipe.parquet", tmp_path / "link.parquet")
+    for name in ("pipe.parquet", "link.parquet"):
+        with pytest.raises(TraceError, match=f"{name}: a pipe, not a file"):
+            read_trace(tmp_path / name)
+        with pytest.raises(LaeError, match="a pipe, not a file"):
+            digest(str(tmp_path / name))
+    with pytest.raises(TraceError, match="a device, not a file"):
+        validate(os.devnull)
 
 
 def test_a_truncated_file(path: Path) -> None:

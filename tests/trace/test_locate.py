@@ -149,9 +149,12 @@ def test_a_digest_is_of_the_content(folder: Path, memory: Any) -> None:
             digest(path)
 
 
-def test_a_path_is_left_to_arrow() -> None:
-    with opened("any") as source:
-        assert source == "any"
+def test_a_path_is_opened(tmp_path: Path) -> None:
+    (tmp_path / "any").write_bytes(b"bytes")
+    with opened(str(tmp_path / "any")) as source:
+        assert source.read() == b"bytes"
+    with pytest.raises(FileNotFoundError), opened(str(tmp_path / "none")):
+        pass
 
 
 def test_a_trace_is_read_from_a_url(folder: Path, memory: Any) -> None:

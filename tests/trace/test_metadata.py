@@ -10,7 +10,7 @@ import pytest
 from witness import MINIMAL
 
 from lae_sim.errors import TraceError
-from lae_sim.trace.metadata import KINDS, Metadata, Search
+from lae_sim.trace.metadata import KINDS, ImageSizes, Metadata, Search
 
 
 def parse(**changes: Any) -> Metadata:
@@ -93,6 +93,16 @@ def test_an_optional_key_that_is_read_must_be_an_object(key: str, value: Any) ->
         {"image_size": [True, 360]},
         {"image_size": [2**31, 360]},
         {"image_size": ["640", "360"]},
+        {"image_size": [640, 360], "image_sizes": []},
+        {"image_size": [640, 360], "image_sizes": {"0": [640, 360]}},
+        {"image_size": [640, 360], "image_sizes": [[0, 320, 360]]},
+        {"image_size": [640, 360], "image_sizes": [[1, 640, 360]]},
+        {"image_size": [640, 360], "image_sizes": [[0, 640, 360], [0, 320, 180]]},
+        {"image_size": [640, 360], "image_sizes": [[0, 640, 360], [4, 320]]},
+        {"image_size": [640, 360], "image_sizes": [[0, 640, 360], [4.0, 320, 180]]},
+        {"image_size": [640, 360], "image_sizes": [[0, 640, 360], [4, 320, 0]]},
+        {"image_size": [640, 360], "image_sizes": [[0, 640, 360], []]},
+        {"image_sizes": [[0, 640, 360], [4, 320, 180]]},
         {"attributes": "Occlusion"},
         {"attributes": [1]},
         {"attributes": {"Occlusion": True}},
@@ -115,6 +125,19 @@ def test_what_is_known_is_read() -> None:
     assert metadata.image_size("Gull2") == (640, 360)
     assert metadata.attributes("Gull2") == ("Occlusion", "Blur")
     assert metadata.image_size("Car1") is None
+
+
+def test_images_that_change_size() -> None:
+    seen = ImageSizes.of([0, 3, 4, 8, 9], [(64, 36), (64, 36), (32, 18), (32, 18), (64, 36)])
+    assert seen == ImageSizes((0, 4, 9), ((64, 36), (32, 18), (64, 36)))
+    assert [seen.at(frame)[0] for frame in (0, 3, 4, 8, 9, 99)] == [64, 64, 32, 32, 64, 64]
+    same = ImageSizes.of([0, 1], [[64, 36], [64, 36]])
+    assert same == ImageSizes.constant((64, 36))
+    assert same.entry() == {"image_size": [64, 36]}
+    metadata = parse(sequences={"a": seen.entry(), "b": same.entry(), "c": {}})
+    assert metadata.image_size("a") == (64, 36)
+    assert [metadata.image_sizes(name) for name in "abc"] == [seen, same, None]
+    assert metadata.resized == ["a"]
 
 
 def test_measured_times_need_no_note() -> None:

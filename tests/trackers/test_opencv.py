@@ -100,12 +100,29 @@ def test_track_before_init_is_refused():
         make_tracker("opencv:mil", {}).track(next(moving(straight(1))))
 
 
-def test_frames_that_change_in_size_are_refused():
+def test_a_tracker_that_cannot_go_on_where_frames_change_in_size(monkeypatch):
+    class Stops:
+        def update(self, frame):
+            if frame.shape != (240, 320, 3):
+                raise cv2.error("prevPyr[level * lvlStep1].size() == nextPyr[...].size()")
+            return True, (60, 80, 40, 40)
+
     frame = next(moving(straight(1)))
     tracker = make_tracker("opencv:mil", {})
     tracker.init(frame, (60, 80, 40, 40))
-    with pytest.raises(LaeError, match="from 320 x 240 to 300 x 240 pixels"):
+    monkeypatch.setattr(tracker, "_tracker", Stops())
+    assert tracker.track(frame) == (60, 80, 40, 40)
+    with pytest.raises(LaeError, match="cannot go on where frames change from 320 x 240 to 300 x"):
         tracker.track(frame[:, :300])
+
+
+def test_frames_may_change_in_size():
+    frame = next(moving(straight(1)))
+    tracker = make_tracker("opencv:mil", {})
+    tracker.init(frame, (60, 80, 40, 40))
+    for width in (300, 150, 320):
+        x, y, _, _ = tracker.track(frame[:, :width])
+        assert max(abs(x - 60), abs(y - 80)) < 5
     with pytest.raises(LaeError, match="uint8"):
         tracker.track(frame.astype(np.uint16))
 
