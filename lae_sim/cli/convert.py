@@ -151,6 +151,8 @@ def _convert(arguments: argparse.Namespace) -> None:
 
 def _text(summary: ConversionSummary, out: Path) -> str:
     """The summary for people."""
+    from lae_sim.datasets.dropped import note
+
     processed = "every frame"
     if summary.schedule == "real-time":
         processed = f"in real time, {summary.processed:,} processed"
@@ -170,6 +172,9 @@ def _text(summary: ConversionSummary, out: Path) -> str:
             f"{len(summary.held)} sequences ({listed(list(summary.held))}); there its last one "
             "stands."
         )
+    if summary.frame_times:
+        said = note(summary.numbers_missing, summary.frame_times)
+        lines.append(f"{said[0].upper()}{said[1:]}.")
     if summary.row_0_from_truth:
         lines.append(
             f"Row 0 is not the initial box in {len(summary.row_0_from_truth)} of "

@@ -38,18 +38,18 @@ class ImageSequence:
             row is the initial box.
         read: ``read(frame)`` decodes (or renders) a frame, in any order, from any thread.
         attributes: the dataset's attributes of the sequence, such as ``"Occlusion"``.
-        arrival_ns: when each frame arrives, ns after the first, int64 [T], ascending from 0; None =
-            at the dataset's frame rate.
         visible: False where the dataset says that the target is absent or fully covered, bool [T];
             None = it says nothing.
+        arrival_ns: when each frame arrives, ns after the first, int64 [T], ascending from 0; None =
+            at the dataset's frame rate.
     """
 
     name: str
     truth: Floats
     read: Callable[[int], Image]
     attributes: tuple[str, ...] = ()
-    arrival_ns: Ints | None = None
     visible: Bools | None = None
+    arrival_ns: Ints | None = None
 
     def __len__(self) -> int:
         """Number of frames T."""
@@ -67,17 +67,17 @@ class Dataset:
         name: the dataset's name, such as ``"DTB70"``.
         fps: its frame rate, frames per second, exact.
         sequences: sorted by name.
-        notes: what a user should know of them: files beside the images and the truth that could not
-            be read and why, and image numbers that are missing.
         frame_times: how frames come where image numbers are missing: ``"numbers"`` or ``"even"``;
             None where none is.
+        notes: what a user should know of them: files beside the images and the truth that could not
+            be read and why, and image numbers that are missing.
     """
 
     name: str
     fps: Fraction
     sequences: Sequence[ImageSequence]
-    notes: Sequence[str] = ()
     frame_times: str | None = None
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"<Dataset {self.name!r}: {len(self.sequences)} sequences at {self.fps} fps>"

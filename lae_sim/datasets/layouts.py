@@ -122,35 +122,35 @@ def find_dataset(
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
-    made, numbers = [], []
-    notes = [*attributes.notes]
-    for sequence in _choose(sequences, truth.files, str(root)):
-        file = truth.files[sequence]
-        found, of_images = _sequence(root, sequence, file, attributes.of.get(sequence, ()))
-        visible, problem = read_visible(file, len(found))
-        made.append(replace(found, visible=visible))
-        numbers.append(of_images)
-        notes += [f"sequence {sequence!r}: {problem}"] if problem else []
+    found, notes = [], list(attributes.notes)
+    for each in _choose(sequences, truth.files, str(root)):
+        file = truth.files[each]
+        sequence, numbers = _sequence(root, each, file, attributes.of.get(each, ()))
+        visible, left_out = read_visible(file, len(sequence))
+        found.append((replace(sequence, visible=visible), numbers))
+        notes += [f"sequence {each!r}: {left_out}"] if left_out else []
     fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
-    return _timed(Dataset(name, fps, made, tuple(notes)), numbers, frame_times)
+    return _timed(name, fps, found, frame_times, notes)
 
 
-def _timed(dataset: Dataset, numbers: Sequence[Sequence[int]], frame_times: str | None) -> Dataset:
-    """The dataset with the times of its frames, given the numbers of each sequence's images."""
-    sequences = dataset.sequences
-    gaps = [sequence.name for sequence, own in zip(sequences, numbers) if missing(own)]
+def _timed(
+    name: str,
+    fps: Fraction,
+    sequences: Sequence[tuple[ImageSequence, Sequence[int]]],
+    frame_times: str | None,
+    notes: Sequence[str] = (),
+) -> Dataset:
+    """The dataset of sequences with the numbers of their images."""
+    made = [sequence for sequence, _ in sequences]
+    gaps = [(sequence.name, numbers) for sequence, numbers in sequences if missing(numbers)]
     if not gaps:
-        return dataset
+        return Dataset(name, fps, made, notes=tuple(notes))
     if frame_times is None:
-        first = next(s for s, own in enumerate(numbers) if missing(own))
-        raise ask(sequences[first].name, numbers[first], dataset.fps)
+        raise ask(*gaps[0], fps)
     if frame_times == "numbers":  # of all: a trace has the times of every frame, or of none
-        sequences = [
-            replace(sequence, arrival_ns=arrivals(own, dataset.fps))
-            for sequence, own in zip(sequences, numbers)
-        ]
-    notes = (*dataset.notes, note(gaps, frame_times))
-    return replace(dataset, sequences=sequences, notes=notes, frame_times=frame_times)
+        made = [replace(each, arrival_ns=arrivals(numbers, fps)) for each, numbers in sequences]
+    of_gaps = note((gap for gap, _ in gaps), frame_times)
+    return Dataset(name, fps, made, frame_times, (*notes, of_gaps))
 
 
 def _without_truth(
@@ -182,8 +182,8 @@ def _without_truth(
         read, length = partial(_read, sequence, paths), len(paths)
         numbers = _numbers(paths)
     truth = _only_first(np.array([box], np.float64), length)
-    made = [ImageSequence(sequence, truth, read)]
-    return _timed(Dataset(name or sequence, fps or Fraction(30), made), [numbers], frame_times)
+    images = [(ImageSequence(sequence, truth, read), numbers)]
+    return _timed(name or sequence, fps or Fraction(30), images, frame_times)
 
 
 def _sequence(

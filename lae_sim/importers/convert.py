@@ -14,7 +14,7 @@ import numpy as np
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.absence import absence_files, read_visible
 from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
-from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing, note
+from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing
 from lae_sim.datasets.layouts import image_numbers
 from lae_sim.datasets.names import Reading, SequenceNames
 from lae_sim.engine.clock import Clock, Number, parse_fps
@@ -66,6 +66,7 @@ class ConversionSummary:
         held: frames of each sequence in which the tracker had no box, and its last one stands.
         frame_times: how frames come where image numbers are missing: ``"numbers"`` or ``"even"``;
             None where none is, or no images are at hand.
+        numbers_missing: the sequences where some are.
         row_0_from_truth: sequences whose row 0 was more than 3 px off the initial box, from which
             the tracker started; in the trace it is that box.
         other_trackers: trackers whose results lie there too, and were left out.
@@ -88,6 +89,7 @@ class ConversionSummary:
     times_read_as: str | None
     held: Mapping[str, int]
     frame_times: str | None
+    numbers_missing: list[str]
     row_0_from_truth: list[str]
     other_trackers: list[str]
     without_truth: list[str]
@@ -213,6 +215,7 @@ def convert_results(
             raise LaeError("--time-unit is that of measured times, and none are read here")
     as_published = converted.recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
+    attributes = read_attributes(annotations)
     recordings, notes = _flagged(recordings, annotations)
     incomplete: list[str] = []
     if kind != "lae-pvt":  # whose recorded loop took the frames evenly, whatever their numbers
@@ -221,10 +224,7 @@ def convert_results(
         raise LaeError(
             "--frame-times numbers does not go with lae-pvt: its runs took frames evenly"
         )
-    if incomplete and frame_times:
-        notes.append(note(incomplete, frame_times))
     frame_times = frame_times if incomplete else None
-    attributes = read_attributes(annotations)
     metadata = Metadata.new(
         rate,
         **schedule,
@@ -250,6 +250,7 @@ def convert_results(
         times_read_as=converted.times_read_as,
         held=converted.held,
         frame_times=frame_times,
+        numbers_missing=incomplete,
         row_0_from_truth=[
             new.name for new, old in zip(recordings, as_published) if new.boxes is not old.boxes
         ],
@@ -529,6 +530,26 @@ def _started(recording: Recording, results: Path) -> Recording:
     return replace(recording, boxes=np.concatenate([truth[:1], boxes[1:]]))
 
 
+def _flagged(
+    recordings: Iterable[Recording], truth: GroundTruth
+) -> tuple[list[Recording], list[str]]:
+    """The recordings with the dataset's flags of absence, and what is to be said of these."""
+    flagged, notes = [], []
+    for recording in recordings:
+        visible, note = read_visible(truth.files[recording.name], len(recording))
+        flagged.append(replace(recording, visible=visible))
+        notes += [f"sequence {recording.name!r}: {note}"] if note else []
+    absent = [int((~each.visible).sum()) for each in flagged if each.visible is not None]
+    if any(absent):
+        notes.insert(
+            0,
+            f"the target is said to be absent in {sum(absent):,} frames, in "
+            f"{np.count_nonzero(absent)} of {len(flagged)} sequences; --convention lasot leaves "
+            "them out",
+        )
+    return flagged, notes
+
+
 def _arrived(
     recordings: list[Recording], truth: GroundTruth, fps: Fraction, frame_times: str | None
 ) -> tuple[list[Recording], list[str]]:
@@ -551,26 +572,6 @@ def _arrived(
         for each in recordings
     ]
     return placed, incomplete
-
-
-def _flagged(
-    recordings: Iterable[Recording], truth: GroundTruth
-) -> tuple[list[Recording], list[str]]:
-    """The recordings with the dataset's flags of absence, and what is to be said of these."""
-    flagged, notes = [], []
-    for recording in recordings:
-        visible, note = read_visible(truth.files[recording.name], len(recording))
-        flagged.append(replace(recording, visible=visible))
-        notes += [f"sequence {recording.name!r}: {note}"] if note else []
-    absent = [int((~each.visible).sum()) for each in flagged if each.visible is not None]
-    if any(absent):
-        notes.insert(
-            0,
-            f"the target is said to be absent in {sum(absent):,} frames, in "
-            f"{np.count_nonzero(absent)} of {len(flagged)} sequences; --convention lasot leaves "
-            "them out",
-        )
-    return flagged, notes
 
 
 def _sequence_entries(

@@ -32,7 +32,7 @@ _MOST_RATIO = 100
 _FEW_ROWS = 6
 _LONGEST_START_S = 600
 _IN_A_HEADER = re.compile(
-    r"(?:^|[^a-z])(?:(?P<ms>ms|msecs?|milli(?:second)?s?)|(?P<us>us|µs|micro(?:second)?s?)"
+    r"(?:^|[^a-z])(?:(?P<ms>ms|msecs?|milli(?:second)?s?)|(?P<us>us|\u00b5s|\u03bcs|micro(?:second)?s?)"
     r"|(?P<ns>ns|nano(?:second)?s?)|(?P<fps>fps)|(?P<s>s|secs?|seconds?))(?:[^a-z]|$)"
 )
 

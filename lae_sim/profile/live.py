@@ -262,7 +262,7 @@ class Live:
                 elapsed,
                 scores,
                 self._sequence.arrival_ns,
-                visible=self._sequence.visible,
+                self._sequence.visible,
             ),
             frames,
             np.array([answer.elapsed_ns for answer in self._answers], np.int64),

@@ -62,7 +62,7 @@ class StudyResults:
         ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
         ...     )
         ...     results.to_frame().shape
-        (16, 39)
+        (16, 43)
         >>> results
         <StudyResults of 2 settings, 2 cells in ...>
         >>> results.summary_frame()[["forecaster", "auc", "vs_hold_auc"]].round(3)

@@ -90,6 +90,7 @@ def test_json(world, convert):
         "times_read_as": "seconds per frame, as no unit was given",
         "held": {},
         "frame_times": None,
+        "numbers_missing": [],
         "row_0_from_truth": [],
         "other_trackers": [],
         "without_truth": [],
