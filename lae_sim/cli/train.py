@@ -9,7 +9,6 @@ from functools import partial
 
 from lae_sim.cli.options import add_worlds, argument, check_outputs, exit_status, new_parser
 from lae_sim.engine.clock import whole
-from lae_sim.files import check_folders
 
 PROGRAM = "lae-sim train"
 
@@ -70,7 +69,6 @@ def _train(arguments: argparse.Namespace) -> None:
 
     paths = find_traces(arguments.traces)
     check_outputs(arguments, [arguments.out], paths)
-    check_folders([arguments.out])
     worlds = worlds_of(arguments)
     traces = [read_trace(path, arguments.sequence) for path in paths]
     examples = Examples.of_traces(traces, worlds, arguments.exclude)
