@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -222,7 +223,6 @@ def run_pass(
         LaeError: if a finished sequence cannot be written.
     """
     failures = []
-    finished = set(journal.finished(task.name))
     cold, read_at = True, -math.inf
     for order, sequence in enumerate(dataset.sequences):
         left = task.work(sequence)
@@ -232,7 +232,7 @@ def run_pass(
             left -= frames
             progress(frames)
 
-        if sequence.name in finished:
+        if journal.holds(task.name, sequence.name):
             advance(left)
             continue
         ready = replace(sequence, read=Buffered(sequence.read, len(sequence)))
@@ -267,7 +267,8 @@ def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> boo
     Raises:
         LaeError: if it cannot be written.
     """
-    kept = [metadata.document for metadata in journal.metadata(task.name)]
+    traces = journal.traces(task.name)
+    kept = [trace.metadata.document for trace in traces]
     if not kept:
         return False
     document = dict(task.metadata.document)
@@ -288,7 +289,7 @@ def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> boo
     measured = sum(entry["measured_ns"] for entry in entries)
     cpu = sum(entry["cpu_ns"] for entry in entries)
     document["timing"] = {**document["timing"], "cpu_share": round(cpu / max(measured, 1), 3)}
-    recordings: Iterable[Recording] = journal.recordings(task.name)
+    recordings: Iterable[Recording] = chain.from_iterable(traces)
     if task.metadata.kind == "restarts":  # "a b" before "a", but "a@1+3" before "a b@1+3"
         recordings = sorted(recordings, key=lambda recording: recording.name)
     write_trace(Trace(Metadata.of(document), recordings), task.path)

@@ -25,7 +25,14 @@ from lae_sim.engine.clock import (
     whole,
 )
 from lae_sim.errors import LaeError, hint, shown
-from lae_sim.files import check_distinct, check_folders, sequence_names
+from lae_sim.files import (
+    NAME_MAX,
+    check_distinct,
+    check_places,
+    locked,
+    sequence_names,
+    text_digest,
+)
 from lae_sim.forecast.camera import Camera
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import files_named, load_forecaster
@@ -285,8 +292,22 @@ def run_profile(
     """
     dataset = find_dataset(plan.dataset, plan.root, plan.sequences, plan.box, plan.fps)
     path = _trace_path(out, f"{plan.tracker}-{dataset.name}")
-    check_folders([str(path)])
-    unfinished = path.with_suffix(".unfinished")
+    check_places([path])
+    with locked(path, f"{path}: another profile"):
+        return _run(plan, dataset, path, resume, force, progress, notice)
+
+
+def _run(
+    plan: ProfilePlan,
+    dataset: Dataset,
+    path: Path,
+    resume: bool,
+    force: bool,
+    progress: Callable[[int, int], object],
+    notice: Callable[[str], object],
+) -> Profile:
+    """The profile of a dataset, while no other writes the trace."""
+    unfinished = _beside(path, ".unfinished")
     if resume and path.exists() and not unfinished.exists():
         metadata = read_trace(path).metadata
         notice(
@@ -295,11 +316,12 @@ def run_profile(
         )
         return Profile((), ())
     failures: dict[str, list[Failure]] = {}
-    interrupted = False
+    interrupted: KeyboardInterrupt | None = None
     with closing(_start(plan, notice)) as started:
         with suppress(LaeError):  # a tracker may import libraries, or reach the GPU, only now
             warm_up(started, dataset.sequences[0], min(plan.warmup, 1))
         passes = _passes(plan, dataset, started, path, notice)
+        check_places(each.path for each in passes)
         _check_files(plan, passes, force)
         if path.exists() and not resume:
             notice(f"{path} will be replaced")
@@ -321,8 +343,8 @@ def run_profile(
                 failures[task.name] = run_pass(
                     task, dataset, started, journal, plan.warmup, advance
                 )
-        except KeyboardInterrupt:
-            interrupted = True
+        except KeyboardInterrupt as error:
+            interrupted = error
     written = [task for task in passes if write_pass(task, journal, failures.get(task.name, []))]
     if not interrupted:
         journal.remove()
@@ -335,7 +357,7 @@ def run_profile(
     if interrupted:
         kept = f"{path} holds what is complete; " if written else ""
         notice(f"{kept}--resume goes on")
-        raise KeyboardInterrupt
+        raise interrupted
     if not written:
         raise LaeError("no sequence could be profiled")
     return Profile(tuple(summary(task.path) for task in written), failed)
@@ -348,6 +370,13 @@ def _trace_path(out: str | os.PathLike[str] | None, name: str) -> Path:
     if not str(out).endswith(".parquet"):
         raise LaeError(f"out {out}: call the trace something.parquet")
     return Path(out)
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    """The path with another suffix; under a short name if that were too long."""
+    longer = path.with_suffix(suffix)
+    short = len(os.fsencode(longer.name)) <= NAME_MAX
+    return longer if short else path.with_name(text_digest(path.name) + suffix)
 
 
 def _path(value: Any) -> str:
