@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import select
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from fractions import Fraction
 from itertools import product
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
@@ -193,20 +196,34 @@ def new_parser(program: str, description: str, examples: str) -> argparse.Argume
     )
 
 
-def exit_status(work: Callable[[], None], program: str) -> int:
-    """Do the work of a command; its exit status is 0, 2 for an error, 130 for Ctrl-C.
+class Ended(KeyboardInterrupt):
+    """A signal to end, which is heeded as Ctrl-C is."""
 
-    An error is one or two lines on the standard error stream, without a traceback. Work prints when
-    it has written its files: that nobody reads what it prints is no error.
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = signal.Signals(number)
+
+
+def exit_status(work: Callable[[], None], program: str) -> int:
+    """Do the work of a command; its exit status is 0, or 2 for an error.
+
+    After Ctrl-C it is 130, after SIGTERM 143 and after SIGHUP 129, each 128 and its number: what
+    ends the work takes its half-written files with it. An error is one or two lines on the standard
+    error stream, without a traceback. Work prints when it has written its files: that nobody reads
+    what it prints is no error.
     """
     _occupy_closed_streams()
     try:
-        work()
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        with _signals_raised():
+            work()
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except Ended as end:
+        tell(f"{program}: ended by {end.number.name}")
+        return 128 + end.number
     except KeyboardInterrupt:
         tell(f"{program}: interrupted")
-        return 130
+        return 128 + signal.SIGINT
     except (LaeError, OSError) as error:
         if isinstance(error, BrokenPipeError) and _reader_gone(sys.stdout):  # such as head
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -214,6 +231,25 @@ def exit_status(work: Callable[[], None], program: str) -> int:
         tell(f"{program}: error: {error}")
         return 2
     return 0
+
+
+@contextmanager
+def _signals_raised() -> Iterator[None]:
+    """Raise signals that would end this process at once, unless they are ignored, as by nohup."""
+
+    def end(number: int, frame: object) -> None:
+        raise Ended(number)
+
+    ours = threading.current_thread() is threading.main_thread()  # no other may ask for signals
+    numbers = [signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)] if ours else []
+    raised = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in raised:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in raised:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _occupy_closed_streams() -> None:
@@ -242,7 +278,7 @@ def check_outputs(
     outputs: Iterable[str | os.PathLike[str] | None],
     traces: Iterable[str] = (),
 ) -> None:
-    """Refuse, before the work, files that would replace what a command reads, or a trace.
+    """Refuse, before the work, files that cannot be written, or would replace what is read.
 
     Args:
         arguments: of which the options that all commands call alike are looked at.
@@ -250,9 +286,9 @@ def check_outputs(
         traces: those it reads, as they were found.
 
     Raises:
-        LaeError: if one is an input, another output or a trace.
+        LaeError: if one is an input, another output or a trace, or cannot be written.
     """
-    from lae_sim.files import check_distinct
+    from lae_sim.files import check_distinct, check_places
     from lae_sim.learning.registry import files_named
     from lae_sim.trace.file import trace_at
 
@@ -268,6 +304,7 @@ def check_outputs(
     for path in written:
         if trace_at(path) is not None:
             raise LaeError(f"{path} is a trace: name another file")
+    check_places(path for path in written if not os.path.isdir(path))
 
 
 def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]:
