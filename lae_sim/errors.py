@@ -47,15 +47,28 @@ def explained(what: str) -> Iterator[None]:
 
 def described(error: BaseException) -> str:
     """An error that was caught, in one line: its type, its message and where it was raised."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    message = " ".join(str(error).split())[:300]
-    return f"{type(error).__name__}: {message} ({last.filename}, line {last.lineno})"
+    try:
+        message = one_line(str(error))[:300]
+    except Exception:  # a user's own error may fail in saying what it is
+        message = "without a message"
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+    kind = "out of memory: " if isinstance(error, MemoryError) else ""
+    return f"{kind}{type(error).__name__}: {message}{place}"
 
 
 def shown(value: object) -> str:
     """A value in one line of at most 60 characters."""
-    text = " ".join(repr(value).split())
+    try:
+        text = one_line(repr(value))
+    except Exception:  # a user's object, or an integer of thousands of digits
+        text = f"<{type(value).__name__}>"
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def one_line(text: str) -> str:
+    """Text without line breaks and whatever else does not print, be it half a character."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
 def hint(name: object, known: Iterable[str]) -> str:
