@@ -50,11 +50,11 @@ def described(error: BaseException) -> str:
     try:
         message = one_line(str(error))[:300]
     except Exception:  # a user's own error may fail in saying what it is
-        message = "without a message"
+        message = ""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
     kind = "out of memory: " if isinstance(error, MemoryError) else ""
-    return f"{kind}{type(error).__name__}: {message}{place}"
+    return f"{kind}{type(error).__name__}{message and ': '}{message}{place}"
 
 
 def shown(value: object) -> str:

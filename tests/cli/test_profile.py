@@ -21,7 +21,7 @@ from lae_sim.replay.world import replay_trace
 from lae_sim.trace.file import read_trace, validate
 
 TRACKERS = """
-import os, sys, time
+import os, subprocess, sys, time
 import numpy as np
 
 
@@ -46,6 +46,10 @@ class Bright:
                 time.sleep(60)
             if self.how == "exit":
                 os._exit(3)
+            if self.how == "wait":  # with a process of its own
+                with open("child.new", "w") as file:
+                    file.write(str(subprocess.Popen(["sleep", "1004"]).pid))
+                os.rename("child.new", "child")
             while self.how == "wait" and not os.path.exists("go"):
                 time.sleep(0.02)
             if self.how == "wait":
@@ -103,9 +107,10 @@ def start(here: Path, *arguments: str, module: str = "profile", **more: Any) -> 
     )
 
 
-def heed_ctrl_c() -> None:
-    """In a child: not to ignore Ctrl-C where the tests run in the background of a shell."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def heed_signals() -> None:
+    """In a child: not to ignore Ctrl-C or SIGHUP where the tests run in a shell's background."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def profile(here: Path, *arguments: str, status: int = 0, **more: Any) -> tuple[str, str]:
@@ -114,6 +119,26 @@ def profile(here: Path, *arguments: str, status: int = 0, **more: Any) -> tuple[
     assert process.returncode == status, (out, err)
     assert "Traceback" not in err
     return out, err
+
+
+def waited_for(path: Path) -> Path:
+    """A file, once it is there."""
+    deadline = time.monotonic() + 60
+    while not path.exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return path
+
+
+def process_is_there(number: int) -> bool:
+    """Whether a process has not ended."""
+    try:
+        os.kill(number, 0)
+        state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
+    except ProcessLookupError:
+        return False
+    except FileNotFoundError:  # it has ended since, or there is no /proc
+        return not Path("/proc/self").exists()
+    return state != "Z"  # whose parent has not asked for it yet
 
 
 MINE = ("--tracker", "mine:Bright", "--root", "data")
@@ -275,22 +300,28 @@ def test_kill_and_resume(here: Path) -> None:
     assert "complete" in err
 
 
-def test_ctrl_c_keeps_what_is_complete(here: Path) -> None:
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_what_ends_a_profile_keeps_what_is_complete(here: Path, end: signal.Signals) -> None:
     waits = ("--option", "fail_at=1", "how=wait")  # in the second sequence, until told to go on
     options = (*MINE, *waits, "--out", "t.parquet", "--warmup", "0", "--frame-timeout", "600s")
-    process = start(here, *options, start_new_session=True, preexec_fn=heed_ctrl_c)
-    deadline = time.monotonic() + 60
-    while not list(here.glob("t.unfinished/first/[!.]*.parquet")) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGINT)
+    process = start(here, *options, start_new_session=True, preexec_fn=heed_signals)
+    child = int(waited_for(here / "child").read_text())
+    assert process_is_there(child)
+    os.killpg(process.pid, end)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 130, err
+    assert process.returncode == 128 + end, err
     assert "Traceback" not in err
     assert "--resume" in err
     assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a"]
-    (here / "go").touch()
-    profile(here, *options, "--resume")
-    assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a", "bad", "c"]
+    deadline = time.monotonic() + 60
+    while process_is_there(child) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not process_is_there(child)
+    if end == signal.SIGINT:
+        (here / "go").touch()
+        profile(here, *options, "--resume")
+        assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a", "bad", "c"]
+        assert not list(here.glob(".*"))
 
 
 def test_a_full_disk_is_an_error_and_leaves_no_trace(here: Path) -> None:
