@@ -126,13 +126,13 @@ def run_out_of_memory() -> None:
     np.zeros(10**15)
 
 
-class Mute(Exception):
+class MuteError(Exception):
     def __str__(self) -> str:
         raise RuntimeError("no text")
 
 
 def fail_mutely() -> None:
-    raise Mute
+    raise MuteError
 
 
 def fail() -> None:

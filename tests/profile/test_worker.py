@@ -261,7 +261,7 @@ def test_init_may_crash_or_hang(start: Any, end: str) -> None:
     [
         ("fail", r"track: ValueError: no target here \(.*misbehaving\.py, line \d+\)$"),
         ("leave_politely", r"track: SystemExit: usage: tracker \(.*misbehaving\.py, line \d+\)$"),
-        ("fail_mutely", r"track: Mute \(.*misbehaving\.py, line \d+\)$"),
+        ("fail_mutely", r"track: MuteError \(.*misbehaving\.py, line \d+\)$"),
         ("run_out_of_memory", r"track: out of memory: \w*MemoryError: Unable to allocate .* \("),
     ],
 )
