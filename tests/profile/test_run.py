@@ -6,8 +6,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from fakes import bright_frame
 
 from lae_sim.comparison.fidelity import compare_closed_loops, summarise_closed_loops
 from lae_sim.errors import LaeError
@@ -15,7 +17,20 @@ from lae_sim.profile.passes import Failure
 from lae_sim.profile.run import Profile, ProfilePlan, profile_tracker, run_profile
 from lae_sim.trace.file import read_trace
 
-QUICK = {"sequences": ["race"], "in_process": True, "warmup": 0}
+LENGTH = 20
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Settings of a quick profile, of a short sequence of small images."""
+    root = tmp_path_factory.mktemp("data")
+    folder = root / "race" / "img"
+    folder.mkdir(parents=True)
+    for i in range(LENGTH):
+        cv2.imwrite(str(folder / f"{i + 1:04}.png"), bright_frame(5 + 2 * i, 20, size=(80, 64)))
+    boxes = [f"{5 + 2 * i},20,12,10\n" for i in range(LENGTH)]
+    (root / "race" / "groundtruth_rect.txt").write_text("".join(boxes))
+    return {"root": root, "in_process": True, "warmup": 0}
 
 
 def test_text_and_numbers_make_a_plan() -> None:
@@ -52,13 +67,13 @@ def test_settings_that_cannot_be(settings: dict[str, Any], message: str) -> None
         ProfilePlan.of(**settings)
 
 
-def test_passes_progress_and_closed_loops(tmp_path: Path) -> None:
+def test_passes_progress_and_closed_loops(tmp_path: Path, quick: dict[str, Any]) -> None:
     progress: list[tuple[int, int]] = []
     notices: list[str] = []
     out = tmp_path / "t.parquet"
     out.write_bytes(b"")
     profile = run_profile(
-        ProfilePlan.of(tracker="dcf", closed_loops=["constant:100ms"], **QUICK),
+        ProfilePlan.of(tracker="dcf", closed_loops=["constant:100ms"], **quick),
         out,
         progress=lambda done, total: progress.append((done, total)),
         notice=notices.append,
@@ -87,9 +102,11 @@ def test_passes_progress_and_closed_loops(tmp_path: Path) -> None:
     assert "nothing to resume" in notices[0]
 
 
-def test_a_profile_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_profile_in_one_call(
+    tmp_path: Path, quick: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "t.parquet"
-    settings = {"sequences": "race", "in_process": True, "warmup": "0", "strides": 1.5}
+    settings = {**quick, "sequences": "race", "warmup": "0", "strides": 1.5}
     profile = profile_tracker("dcf", out=out, fps=29.97, **settings)
     assert capsys.readouterr() == ("", "")  # nobody looks
     first, strided = profile.traces
@@ -109,14 +126,14 @@ def test_a_profile_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_a_profile_shows_its_progress_and_says_what_to_know(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, quick: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "t.parquet"
-    profile_tracker("dcf", out=out, progress=True, **QUICK)
+    profile_tracker("dcf", out=out, progress=True, **quick)
     said, shown = capsys.readouterr()
     assert said == ""
-    assert "160/160" in shown
-    again = profile_tracker("dcf", out=out, progress=True, resume=True, **QUICK)
+    assert f"{LENGTH:.1f}/{LENGTH:.1f}" in shown
+    again = profile_tracker("dcf", out=out, progress=True, resume=True, **quick)
     assert "nothing to resume" in capsys.readouterr().err
     assert repr(again) == "<Profile: nothing was left to do>"
 
