@@ -204,7 +204,8 @@ def _explained(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise LaeError(f"cannot write {path}: {error.strerror or error}") from error
+        reason = os.strerror(error.errno) if error.errno else error  # Arrow adds words of its own
+        raise LaeError(f"cannot write {path}: {reason}") from error
 
 
 def check_distinct(
@@ -310,7 +311,8 @@ def check_place(path: str | os.PathLike[str]) -> None:
     """Refuse to write a file where one cannot be.
 
     Raises:
-        LaeError: if a folder, a pipe or a device is there, or the name is too long.
+        LaeError: if a folder, a pipe or a device is there, or what this process prints goes there,
+            or the name is too long.
     """
     length = len(os.fsencode(os.path.basename(os.path.realpath(path))))
     if length > NAME_MAX:
@@ -319,6 +321,10 @@ def check_place(path: str | os.PathLike[str]) -> None:
         )
     if os.path.exists(path) and not os.path.isfile(path):
         raise LaeError(f"cannot write {path}: it is there already and is not a file")
+    for stream in (1, 2):
+        with suppress(OSError):
+            if os.path.samestat(os.stat(path), os.fstat(stream)):
+                raise LaeError(f"cannot write {path}: what is printed goes there")
 
 
 def file_names(names: Iterable[str], suffix: str = "") -> list[str]:

@@ -89,7 +89,7 @@ def _render(arguments: argparse.Namespace) -> None:
             "folder as --out"
         )
     films = [out / name for name in file_names((run.recording.name for run in runs), ".mp4")]
-    if folder:
+    if out.is_dir():
         check_outputs(arguments, films)
     sequences = {run.recording.name: _images(run, metadata, arguments) for run in runs}
     camera = Camera(sequences, runs[0].schedule.clock.fps)

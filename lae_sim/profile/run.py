@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, fields
 from fractions import Fraction
 from functools import partial
@@ -335,17 +335,19 @@ def _run(
             done += frames
             progress(done, total)
 
-        try:
-            for task in passes:
-                task.prepare(journal)
-                total = sum(each.work(s) for each in passes for s in dataset.sequences)
-                advance(0)
-                failures[task.name] = run_pass(
-                    task, dataset, started, journal, plan.warmup, advance
-                )
-        except KeyboardInterrupt as error:
-            interrupted = error
-    written = [task for task in passes if write_pass(task, journal, failures.get(task.name, []))]
+        with _kept(unfinished):
+            try:
+                for task in passes:
+                    task.prepare(journal)
+                    total = sum(each.work(s) for each in passes for s in dataset.sequences)
+                    advance(0)
+                    failures[task.name] = run_pass(
+                        task, dataset, started, journal, plan.warmup, advance
+                    )
+            except KeyboardInterrupt as error:
+                interrupted = error
+    with _kept(unfinished):
+        written = [t for t in passes if write_pass(t, journal, failures.get(t.name, []))]
     if not interrupted:
         journal.remove()
     failed = tuple(failure for each in failures.values() for failure in each)
@@ -361,6 +363,15 @@ def _run(
     if not written:
         raise LaeError("no sequence could be profiled")
     return Profile(tuple(summary(task.path) for task in written), failed)
+
+
+@contextmanager
+def _kept(unfinished: Path) -> Iterator[None]:
+    """Say of an error, such as a full disk, that nothing is lost."""
+    try:
+        yield
+    except LaeError as error:
+        raise LaeError(f"{error}; {unfinished} keeps what is complete: --resume goes on") from error
 
 
 def _trace_path(out: str | os.PathLike[str] | None, name: str) -> Path:

@@ -38,6 +38,8 @@ class Store:
         """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise LaeError(f"{self.folder}: is there already and is no folder") from error
         except OSError as error:
             raise LaeError(f"{self.folder}: {error.strerror or error}") from error
         with locked(self.results, f"{self.folder}: another study"):
