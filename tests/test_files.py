@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import subprocess
@@ -77,6 +78,17 @@ def test_the_file_has_the_usual_permissions(tmp_path: Path) -> None:
         temporary.write_text("")
     modes = {stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
     assert len(modes) == 1
+
+
+def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path) -> None:
+    def fill() -> None:
+        with written_whole(tmp_path / "out.txt") as temporary:
+            temporary.write_text("half")
+            raise OSError(errno.ENOSPC, "Arrow says it with many words")
+
+    with pytest.raises(LaeError, match=r"cannot write .*out.txt: No space left on device$"):
+        fill()
+    assert not list(tmp_path.iterdir())
 
 
 def killed(block: str, *arguments: object) -> None:
@@ -158,6 +170,18 @@ def test_places_are_checked_before_the_work(tmp_path: Path) -> None:
     }.items():
         with pytest.raises(LaeError, match=f"cannot write .*{message}"):
             check_places([tmp_path / "fine", tmp_path / path])
+
+
+def test_what_is_printed_is_not_replaced(tmp_path: Path) -> None:
+    """As by ``lae-sim replay ... --events log > log``."""
+    program = "from lae_sim.files import check_place\ncheck_place('log')"
+    with (tmp_path / "log").open("w") as log:
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        run = [sys.executable, "-c", program]
+        ended = subprocess.run(
+            run, cwd=tmp_path, env=environment, stdout=log, stderr=subprocess.PIPE, text=True
+        )
+    assert "cannot write log: what is printed goes there" in ended.stderr
 
 
 def test_file_names_are_distinct_and_fit_everywhere() -> None:

@@ -233,8 +233,8 @@ class Scene:
             written = cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)
             if written != len(self.run):
                 raise LaeError(
-                    f"cannot write {path}: only {max(written, 0):.0f} of {len(self.run)} frames were "
-                    "written: the disk is full, or OpenCV has no codec"
+                    f"cannot write {path}: only {max(written, 0):.0f} of {len(self.run)} frames "
+                    "were written: the disk is full, or OpenCV has no codec"
                 )
 
     def strip(self, frames: Sequence[int], width: int = 640) -> Image:

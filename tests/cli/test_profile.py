@@ -364,7 +364,12 @@ def test_a_full_disk_is_an_error_and_leaves_no_trace(here: Path) -> None:
     assert process.returncode == 2, err
     assert "Traceback" not in err
     assert "cannot write" in err
+    assert "File too large" in err
+    assert "t.unfinished keeps what is complete: --resume goes on" in err
     assert not (here / "t.parquet").exists()
+    assert not list(here.rglob("*.part*"))
+    profile(*options, "--resume")
+    assert read_trace(here / "t.parquet").names == ("a", "bad", "c")
 
 
 @pytest.mark.parametrize(
