@@ -12,6 +12,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lae_sim import __version__
 from lae_sim.datasets.frames import Dataset, ImageSequence
 from lae_sim.datasets.layouts import find_dataset
@@ -24,7 +26,7 @@ from lae_sim.engine.clock import (
     parse_stride,
     whole,
 )
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, TraceError, hint, shown
 from lae_sim.files import (
     NAME_MAX,
     check_distinct,
@@ -60,7 +62,10 @@ from lae_sim.progress import ProgressBar, tell
 from lae_sim.replay.latency import time_label
 from lae_sim.replay.strides import phases
 from lae_sim.replay.world import flag, named, parse_policy, several, text
+from lae_sim.trace.checks import RowChecker
+from lae_sim.trace.columns import Rows
 from lae_sim.trace.file import check_replaces, read_trace
+from lae_sim.trace.recording import Recording
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -293,6 +298,7 @@ def run_profile(
     dataset = find_dataset(plan.dataset, plan.root, plan.sequences, plan.box, plan.fps)
     path = _trace_path(out, f"{plan.tracker}-{dataset.name}")
     check_places([path])
+    _check_names(dataset)
     with locked(path, f"{path}: another profile"):
         return _run(plan, dataset, path, resume, force, progress, notice)
 
@@ -574,6 +580,19 @@ def _passes(
         for timing in dict.fromkeys(plan.closed_loops)
     ]
     return passes
+
+
+def _check_names(dataset: Dataset) -> None:
+    """Check that a trace can hold the names of the sequences."""
+    box = np.ones((1, 4))
+    for sequence in dataset.sequences:
+        rows = Rows.of_recordings([Recording.new(sequence.name, box, box, [0])])
+        try:
+            RowChecker(dataset.name, profiled=True)(rows)
+        except TraceError as error:
+            raise LaeError(
+                f"sequence {shown(sequence.name)} has a name that no trace can hold: rename it"
+            ) from error
 
 
 def _check_files(plan: ProfilePlan, passes: Sequence[Pass], force: bool) -> None:

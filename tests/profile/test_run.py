@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -142,3 +144,17 @@ def test_a_failure_shows_in_html_as_text() -> None:
     failed = Profile((), (Failure("<b>", "<script>"),))
     assert "<script>" not in failed._repr_html_()
     assert "failed: &lt;b&gt;: &lt;script&gt;" in failed._repr_html_()
+
+
+def test_a_name_that_no_trace_can_hold_is_refused_before_the_work(
+    tmp_path: Path, quick: dict[str, Any]
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(quick["root"], root)
+    try:
+        os.rename(os.fsencode(root / "race"), os.fsencode(root) + b"/bad\xff")
+    except OSError:
+        pytest.skip("this disk has names of Unicode text only")
+    with pytest.raises(LaeError, match=r"sequence 'bad.udcff' has a name that no trace can hold"):
+        profile_tracker("dcf", out=tmp_path / "t.parquet", **{**quick, "root": root})
+    assert os.listdir(tmp_path) == ["data"]
