@@ -48,7 +48,7 @@ def explained(what: str) -> Iterator[None]:
 def described(error: BaseException) -> str:
     """An error that was caught, in one line: its type, its message and where it was raised."""
     try:
-        message = one_line(str(error))[:300]
+        message = one_line(str(error)[:1000])[:300]
     except Exception:  # a user's own error may fail in saying what it is
         message = ""
     frames = traceback.extract_tb(error.__traceback__)
@@ -60,7 +60,7 @@ def described(error: BaseException) -> str:
 def shown(value: object) -> str:
     """A value in one line of at most 60 characters."""
     try:
-        text = one_line(repr(value))
+        text = one_line(repr(value)[:1000])
     except Exception:  # a user's object, or an integer of thousands of digits
         text = f"<{type(value).__name__}>"
     return text if len(text) <= 60 else f"{text[:57]}..."

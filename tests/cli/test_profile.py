@@ -368,7 +368,9 @@ def test_a_full_disk_is_an_error_and_leaves_no_trace(here: Path) -> None:
     assert "t.unfinished keeps what is complete: --resume goes on" in err
     assert not (here / "t.parquet").exists()
     assert not list(here.rglob("*.part*"))
-    profile(*options, "--resume")
+    process = start(here, *options, "--resume")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
     assert read_trace(here / "t.parquet").names == ("a", "bad", "c")
 
 
