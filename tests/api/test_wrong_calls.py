@@ -244,7 +244,7 @@ def test_studies(keys: dict[str, Any], message: str) -> None:
         ({"traces": SLOW, "folder": 3}, "folder: a path, not 3"),
         (
             {"traces": SLOW, "folder": SLOW},
-            "synthetic-slow.parquet: is there already and is no folder",
+            "slow.parquet: is there already and is no folder",
         ),
         ({"traces": SLOW, "folder": str(TRACES)}, "is not empty and not of a study"),
     ],
