@@ -3,12 +3,12 @@ from .api.evaluation import EvaluationResult, evaluate
 from .api.study import run_study
 from .datasets.layouts import find_dataset
 from .datasets.synthetic import synthetic_dataset
+from .decoding import max_decoded
 from .engine.scheduler import simulate
 from .errors import LaeError, TraceError
 from .evaluation.evaluate import evaluate_runs
 from .evaluation.events import event_log
 from .evaluation.metrics import CONVENTIONS
-from .files import max_decoded
 from .forecast.base import Forecaster, Hold
 from .forecast.kalman import Kalman
 from .importers.convert import convert_results

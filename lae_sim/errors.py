@@ -56,18 +56,28 @@ def explained(what: str) -> Iterator[None]:
 
 def described(error: BaseException) -> str:
     """An error that was caught, in one line: its type, its message and where it was raised."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    message = " ".join(str(error).split())[:300]
-    return f"{type(error).__name__}: {message} ({last.filename}, line {last.lineno})"
+    try:
+        message = one_line(str(error)[:1000])[:300]
+    except Exception:  # a user's own error may fail in saying what it is
+        message = ""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+    kind = "out of memory: " if isinstance(error, MemoryError) else ""
+    return f"{kind}{type(error).__name__}{message and ': '}{message}{place}"
 
 
 def shown(value: object) -> str:
     """A value in one line of at most 60 characters."""
     try:
-        text = " ".join(repr(value).split())
-    except Exception:  # more digits than Python writes, or nested too deeply
-        text = f"a value of type {type(value).__name__}"
+        text = one_line(repr(value)[:1000])
+    except Exception:  # a user's object, or an integer of thousands of digits
+        text = f"<{type(value).__name__}>"
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def one_line(text: str) -> str:
+    """Text without line breaks, with whatever else does not print as :func:`visible` writes it."""
+    return visible(" ".join(text.split()))
 
 
 def visible(text: object, keep: str = "") -> str:

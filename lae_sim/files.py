@@ -1,164 +1,214 @@
-"""Files that appear whole or not at all, how much may be decoded of one; names and digests."""
+"""Files that appear whole or not at all; their locks, names and digests."""
 
 from __future__ import annotations
 
 import hashlib
-import math
 import os
-import re
+import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import unicodedata
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
 from fractions import Fraction
-from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from lae_sim.errors import LaeError, shown, visible
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
-MAX_DECODED = "256MiB"
-"""What a file may take in memory, once it is decoded, unless :func:`max_decoded` says otherwise."""
+NAME_MAX = 255
+"""Bytes of the longest file name that the usual file systems hold."""
 
-_JSON_VALUE_BYTES = 80  # an empty list or dict, and its place in another
-_UNITS = {"": 0, "K": 10, "M": 20, "G": 30, "T": 40}
-_SIZE = re.compile(r"([0-9]{1,15}) ?([KMGT]?)(?:i?B)?\Z")
-# As numpy.errstate: a setting of whoever calls, not of the process.
-_MAX_DECODED: ContextVar[int] = ContextVar("max_decoded", default=256 << 20)  # MAX_DECODED
-
-
-@contextmanager
-def max_decoded(size: str | int) -> Iterator[None]:
-    """Let files take more memory, or less, once they are decoded, while the block runs.
-
-    A small file can unpack to one that no memory holds. So what the content of a file would take is
-    counted before it is decoded: of one sequence of a trace, and of other files in whole. 256 MiB
-    are allowed by default.
-
-    Args:
-        size: bytes, or text such as ``"1GiB"``.
-
-    Raises:
-        LaeError: if it is no size.
-
-    Example:
-        >>> import lae_sim
-        >>> with lae_sim.max_decoded("1GiB"):
-        ...     trace = lae_sim.read_trace("traces/synthetic-slow.parquet")
-        >>> len(trace)
-        8
-    """
-    token = _MAX_DECODED.set(parse_size(size))
-    try:
-        yield
-    finally:
-        _MAX_DECODED.reset(token)
-
-
-def parse_size(size: str | int) -> int:
-    """Bytes, or text such as ``"1GiB"`` (units are powers of 1024), in bytes.
-
-    Raises:
-        LaeError: if it is no size.
-    """
-    match = _SIZE.match(str(size)) if type(size) in (str, int) else None
-    if match is None or not int(match[1]):
-        raise LaeError(f"{shown(size)} is no size in memory: write it as 256MiB or 1GiB")
-    return int(match[1]) << _UNITS[match[2]]
-
-
-class TooLargeError(LaeError):
-    """A file whose content would take more memory than is allowed (see :func:`max_decoded`)."""
-
-
-class Budget:
-    """How much is still to be decoded of a file.
-
-    Args:
-        path: the file, for messages.
-        error: what is raised.
-
-    Attributes:
-        left: bytes.
-    """
-
-    def __init__(self, path: str | os.PathLike[str], error: type[LaeError] = TooLargeError) -> None:
-        self._path, self._error = path, error
-        self.left = _MAX_DECODED.get()
-
-    def take(self, size: int) -> None:
-        """Count what is about to be decoded, bytes.
-
-        Raises:
-            TooLargeError: if it is more than is left.
-        """
-        self.left -= size
-        if self.left < 0:
-            most = _MAX_DECODED.get() / 2**20
-            raise self._error(
-                f"{self._path}: would take more than {most:,.4g} MiB of memory, too much for such "
-                f"a file; if it is right, --max-decoded {math.ceil(4 * most)}MiB allows more"
-            )
-
-
-def within_budget(path: str | os.PathLike[str], size: int) -> None:
-    """Check what a file's content would take in memory, bytes.
-
-    Raises:
-        TooLargeError: if it is too much.
-    """
-    Budget(path).take(size)
-
-
-def json_memory(text: bytes) -> int:
-    """What the values of a JSON document take at most in memory, bytes, before they are decoded."""
-    return 2 * len(text) + _JSON_VALUE_BYTES * sum(map(text.count, (b",", b":", b"[", b"{")))
-
-
-def allowing(work: Callable[[Item], Result]) -> Callable[[Item], Result]:
-    """A function that does the work in another process or thread with the budget of this one."""
-    return partial(_allowed, _MAX_DECODED.get(), work)
-
-
-def _allowed(size: int, work: Callable[[Item], Result], item: Item) -> Result:
-    with max_decoded(size):
-        return work(item)
+_SPECIAL = '<>:"/\\|?*'
+_RESERVED = frozenset(
+    ["", "con", "prn", "aux", "nul", *(f"{kind}{n}" for kind in ("com", "lpt") for n in range(10))]
+)
+_LEFT = f".{'[0-9a-f]' * 16}*.part*"
 
 
 @contextmanager
 def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside ``path``, of the same suffix; on success it takes its place.
 
-    If the block fails, or the process is killed, ``path`` is as it was.
+    If the block fails, or the process is killed, ``path`` is as it was; what a killed process left
+    of its temporary file is removed when ``path`` is written again.
 
     Raises:
         LaeError: if the file cannot be written there.
     """
+    check_place(path)
     target = Path(os.path.realpath(path))  # write where a link points
-    try:
-        if target.exists() and not target.is_file():
-            raise LaeError(f"cannot write {path}: it is there already and is not a file")
-        handle, name = tempfile.mkstemp(
-            prefix=f".{target.stem}.", suffix=f".part{target.suffix}", dir=target.parent
-        )
-    except OSError as error:
-        raise LaeError(f"cannot write {target}: {error.strerror or error}") from error
-    os.close(handle)
-    temporary = Path(name)
-    try:
+    with _explained(target), _temporary(target) as temporary:
         yield temporary
         _sync(temporary)
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, target)
         _sync(target.parent)
-    except OSError as error:
-        raise LaeError(f"cannot write {target}: {error.strerror or error}") from error
+
+
+@contextmanager
+def staged_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder in a folder, to fill with what is then moved out of it.
+
+    What a killed process left of its own is removed with the next.
+
+    Raises:
+        LaeError: if it cannot be made, or something cannot be written in the block.
+    """
+    with _explained(folder), _temporary(folder / "staged", is_folder=True) as temporary:
+        yield temporary
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files that killed processes left in a folder."""
+    for path in folder.glob(_LEFT):
+        _remove_left(path)
+
+
+@contextmanager
+def locked(target: Path, what: str) -> Iterator[None]:
+    """Hold a lock while the block runs, where the system has any.
+
+    It is a file beside the target that is removed afterwards; one that a killed process left holds
+    nobody up.
+
+    Args:
+        target: what is written in the block.
+        what: what another process that holds it would be, to begin a message with.
+
+    Raises:
+        LaeError: if another process holds it, which is named, or there can be no file.
+    """
+    if fcntl is None:
+        yield
+        return
+    path = target.with_name(f".{text_digest(target.name)[:16]}.lock")
+    with _explained(path):
+        while True:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            if _held(descriptor, path, what):
+                break
+            os.close(descriptor)
+    try:
+        with suppress(OSError):  # of a full disk
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {os.uname().nodename}".encode(), 0)
+        yield
     finally:
-        temporary.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _held(descriptor: int, path: Path, what: str) -> bool:
+    """Whether this process has come to hold an open lock file that is still there."""
+    try:
+        return _lock(descriptor, path)
+    except BlockingIOError:
+        holder = os.pread(descriptor, NAME_MAX, 0).decode(errors="replace") or "another process"
+        os.close(descriptor)
+        raise LaeError(
+            f"{what} is at work there ({holder}): wait until it has ended, or end it"
+        ) from None
+    except OSError:  # a file system without locks
+        return True
+
+
+def _lock(descriptor: int, path: Path) -> bool:
+    """Lock an open file for as long as its descriptor is open; False if it has been removed.
+
+    Raises:
+        OSError: if another process holds it (BlockingIOError), or files cannot be locked there.
+    """
+    if fcntl is not None:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(descriptor), os.lstat(path))
+    return False
+
+
+@contextmanager
+def _temporary(target: Path, is_folder: bool = False) -> Iterator[Path]:
+    """A new temporary file or folder beside a target, locked for as long as the block runs."""
+    path, descriptor = _claimed(target, is_folder)
+    try:
+        yield path
+    finally:
+        _removed(path)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _claimed(target: Path, is_folder: bool) -> tuple[Path, int | None]:
+    """A new temporary file or folder beside a target, and the descriptor that holds its lock.
+
+    Its name is short whatever the target's is, and the same in every run, so that the next one
+    finds what a killed one left.
+    """
+    suffix = target.suffix if len(os.fsencode(target.suffix)) <= 16 else ""
+    if fcntl is None:
+        if is_folder:
+            return Path(tempfile.mkdtemp(prefix=".part-", dir=target.parent)), None
+        descriptor, name = tempfile.mkstemp(f".part{suffix}", ".", target.parent)
+        os.close(descriptor)  # or it could not be renamed
+        return Path(name), None
+    key = text_digest(target.name)[:16]
+    for number in count():
+        path = target.with_name(f".{key}{f'-{number}' if number else ''}.part{suffix}")
+        _remove_left(path)
+        try:
+            if is_folder:
+                path.mkdir()
+            descriptor = os.open(
+                path, os.O_RDONLY if is_folder else os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600
+            )
+        except FileExistsError:  # of a process at work
+            continue
+        try:
+            if _lock(descriptor, path):
+                break
+        except BlockingIOError:  # another process takes it for something left
+            pass
+        except OSError:  # a file system without locks
+            break
+        os.close(descriptor)
+    return path, descriptor
+
+
+def _remove_left(path: Path) -> None:
+    """Remove a temporary file or folder unless a process is at work on it."""
+    if fcntl is None:
+        return
+    with suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+        try:
+            if _lock(descriptor, path):
+                _removed(path)
+        finally:
+            os.close(descriptor)
+
+
+def _removed(path: Path) -> None:
+    """Remove a file, if it is there, or a folder and what is in it."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turn what the system says into an error that names the file."""
+    try:
+        yield
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else error  # Arrow adds words of its own
+        raise LaeError(f"cannot write {path}: {reason}") from error
 
 
 def check_distinct(
@@ -218,7 +268,7 @@ def _umask() -> int:
 
 def text_digest(text: str) -> str:
     """The first 32 hexadecimal digits of a text's SHA-256, as a name of what it describes."""
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+    return hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:32]
 
 
 def labels(paths: Sequence[str]) -> list[str]:
@@ -275,12 +325,58 @@ def check_regular(path: str | os.PathLike[str]) -> None:
         raise LaeError(f"{path}: a {what}, not a file: write it to a file, and give that")
 
 
-def check_folders(paths: Iterable[str]) -> None:
-    """Refuse, before work that may take long, files whose folder is not there.
+def check_places(paths: Iterable[str | os.PathLike[str]]) -> None:
+    """Refuse, before work that may take long, files that cannot be written where they should.
 
     Raises:
-        LaeError: if a folder is missing.
+        LaeError: if a folder is missing or cannot be written to, something that is no file is
+            there, or a name is too long.
     """
     for path in paths:
-        if not Path(path).resolve().parent.is_dir():
+        check_place(path)
+        folder = Path(os.path.realpath(path)).parent
+        if not folder.is_dir():
             raise LaeError(f"cannot write {path}: its folder is not there")
+        if not os.access(folder, os.W_OK):
+            raise LaeError(f"cannot write {path}: its folder cannot be written to")
+
+
+def check_place(path: str | os.PathLike[str]) -> None:
+    """Refuse to write a file where one cannot be.
+
+    Raises:
+        LaeError: if a folder, a pipe or a device is there, or what this process prints goes there,
+            or the name is too long.
+    """
+    length = len(os.fsencode(os.path.basename(os.path.realpath(path))))
+    if length > NAME_MAX:
+        raise LaeError(
+            f"cannot write {path}: its name has {length} bytes, and {NAME_MAX} are possible"
+        )
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise LaeError(f"cannot write {path}: it is there already and is not a file")
+    for stream in (1, 2):
+        with suppress(OSError):
+            if os.path.samestat(os.stat(path), os.fstat(stream)):
+                raise LaeError(f"cannot write {path}: what is printed goes there")
+
+
+def file_names(names: Iterable[str], suffix: str = "") -> list[str]:
+    """File names for what has names: such as every system can hold, and no two of them the same.
+
+    Args:
+        names: distinct ones; each is kept where it can be.
+        suffix: of each file.
+    """
+    made: dict[str, str] = {}  # as a system that ignores case tells them apart
+    for name in names:
+        plain = "".join(c if c.isprintable() and c not in _SPECIAL else "-" for c in name)
+        plain = plain.strip(" .")
+        room = NAME_MAX - len(os.fsencode(suffix))
+        key = unicodedata.normalize("NFKC", plain).casefold()
+        if key in made or key.partition(".")[0] in _RESERVED or len(plain.encode()) > room:
+            mark = f"-{text_digest(name)[:8]}"
+            plain = plain.encode()[: room - len(mark)].decode(errors="ignore") + mark
+            key = plain.casefold()
+        made[key] = plain + suffix
+    return list(made.values())

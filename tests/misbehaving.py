@@ -14,6 +14,25 @@ import numpy as np
 
 BOX = (10.0, 20.0, 30.0, 40.0)
 
+
+class Text(str):
+    def __repr__(self) -> str:
+        raise RuntimeError("no text")
+
+
+class NoNumber:
+    def __float__(self) -> float:
+        raise RuntimeError("no number")
+
+    def __repr__(self) -> str:
+        return "NoNumber"
+
+
+class NoFloat(float):
+    def __abs__(self) -> float:
+        raise RuntimeError("no number")
+
+
 ANSWERS: dict[str, Any] = {
     "box": BOX,
     "tuple": (BOX, 0.5),
@@ -29,10 +48,18 @@ ANSWERS: dict[str, Any] = {
     "score none": (BOX, None),
     "score text": (BOX, "high"),
     "score array": (BOX, np.zeros(2)),
+    "score that is no number": (BOX, NoNumber()),
+    "score of 400 digits": (BOX, 10**400),
+    "score of 5000 digits": (BOX, 10**5000),
+    "score beyond float32": (BOX, 1e39),
     "nan": (10, 20, float("nan"), 40),
     "infinity": np.array([10, 20, np.inf, 40]),
     "huge": (10, 20, 30, -1.1e9),
     "huge integer": (10, 20, 30, 10**400),
+    "integer without a text": (10, 20, 30, 10**5000),
+    "no number": (10, 20, 30, NoNumber()),
+    "own text": Text("1234"),
+    "own float": (10, 20, 30, NoFloat(40)),
     "three": (10, 20, 30),
     "five": (10, 20, 30, 40, 50),
     "matrix": np.array([BOX]),
@@ -65,6 +92,12 @@ def hang_with_a_child() -> None:
     hang()
 
 
+def hang_in_c_with_a_child() -> None:
+    """Hang in C code while a child process is at work, whose number is printed."""
+    print(subprocess.Popen(["sleep", "1003"]).pid)
+    hang_in_c()
+
+
 def crash() -> None:
     ctypes.string_at(0)
 
@@ -83,6 +116,23 @@ def leave() -> None:
 
 def leave_politely() -> None:
     sys.exit("usage: tracker")
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt("my own")
+
+
+def run_out_of_memory() -> None:
+    np.zeros(10**15)
+
+
+class MuteError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("no text")
+
+
+def fail_mutely() -> None:
+    raise MuteError
 
 
 def fail() -> None:

@@ -21,7 +21,6 @@ from lae_sim.cli.options import (
 )
 from lae_sim.engine.clock import parse_rational, whole
 from lae_sim.errors import LaeError
-from lae_sim.files import check_folders
 from lae_sim.learning.registry import FORECASTERS
 from lae_sim.progress import print_text
 
@@ -168,7 +167,6 @@ def _check_files(arguments: argparse.Namespace, traces: Sequence[str]) -> None:
     """Refuse what would only fail after the work."""
     outputs = [path for path in (arguments.out, arguments.plot) if path]
     check_outputs(arguments, outputs, traces)
-    check_folders(outputs)
     if arguments.out and Path(arguments.out).suffix not in (".csv", ".parquet"):
         raise LaeError(f"--out {arguments.out}: name a .csv or .parquet file")
     if arguments.plot:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser, print_json
 from lae_sim.errors import LaeError, listed
-from lae_sim.files import check_distinct
+from lae_sim.files import check_distinct, check_places
 from lae_sim.progress import ProgressBar, print_text
 
 if TYPE_CHECKING:
@@ -115,6 +115,7 @@ def _convert(arguments: argparse.Namespace) -> None:
     from lae_sim.importers.convert import convert_results
     from lae_sim.trace.file import check_replaces, write_trace
 
+    check_places([arguments.out])
     truth_files = dict(arguments.truth_file)
     # of a folder those files count that are read (below), and no file is replaced but a trace
     read = (arguments.results, arguments.truth, *truth_files.values())

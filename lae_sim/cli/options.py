@@ -5,16 +5,18 @@ from __future__ import annotations
 import argparse
 import os
 import select
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from itertools import product
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
+from lae_sim.decoding import MAX_DECODED, max_decoded, parse_size
 from lae_sim.engine.clock import parse_fps, parse_rational, whole
 from lae_sim.errors import LaeError, abridged, visible
-from lae_sim.files import MAX_DECODED, max_decoded, parse_size
 from lae_sim.progress import OutputError, print_text, printing, tell
 
 if TYPE_CHECKING:
@@ -226,35 +228,47 @@ def new_parser(program: str, description: str, examples: str) -> argparse.Argume
     return made
 
 
+class Ended(KeyboardInterrupt):
+    """A signal to end, which is heeded as Ctrl-C is."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = signal.Signals(number)
+
+
 def exit_status(
     work: Callable[[], None],
     program: str,
     decoded: int | str = MAX_DECODED,
     prints_result: bool = True,
 ) -> int:
-    """Do the work of a command; its exit status is 0, 2 for an error, 130 for Ctrl-C.
+    """Do the work of a command; its exit status is 0, 2 for an error, 1 where memory ran out.
 
-    It is 1 where memory ran out. An error is one or two lines on the standard error stream, without
-    a traceback. Work prints when it has written its files: that nobody reads what it prints is no
-    error.
+    After Ctrl-C it is 130, after SIGTERM 143 and after SIGHUP 129, each 128 and its number: what
+    ends the work takes its half-written files with it. An error is one or two lines on the standard
+    error stream, without a traceback. Work prints when it has written its files: that nobody reads
+    what it prints is no error.
 
     Args:
         work: reads, computes, writes and prints.
         program: what its messages begin with.
-        decoded: what a file may take in memory (see :func:`lae_sim.files.max_decoded`).
+        decoded: what a file may take in memory (see :func:`lae_sim.decoding.max_decoded`).
         prints_result: whether what it prints is the result, and lost if it cannot be printed; and
             not only words about files.
     """
     _occupy_closed_streams()
     try:
-        with max_decoded(decoded):
+        with _signals_raised(), max_decoded(decoded):
             work()
-        if sys.stdout is not None:
-            with printing():
-                sys.stdout.flush()
+            if sys.stdout is not None:
+                with printing():
+                    sys.stdout.flush()
+    except Ended as end:
+        tell(f"{program}: ended by {end.number.name}")
+        return 128 + end.number
     except KeyboardInterrupt:
         tell(f"{program}: interrupted")
-        return 130
+        return 128 + signal.SIGINT
     except MemoryError:
         tell(f"{program}: error: out of memory: give it more, or fewer sequences or traces at once")
         return 1
@@ -286,6 +300,25 @@ def print_json(document: Mapping[str, Any]) -> None:
     print_text(text.replace("\x7f", "\\u007f"))  # which JSON, but no terminal, takes for a letter
 
 
+@contextmanager
+def _signals_raised() -> Iterator[None]:
+    """Raise signals that would end this process at once, unless they are ignored, as by nohup."""
+
+    def end(number: int, frame: object) -> None:
+        raise Ended(number)
+
+    ours = threading.current_thread() is threading.main_thread()  # no other may ask for signals
+    numbers = [signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)] if ours else []
+    raised = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in raised:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in raised:
+            signal.signal(number, signal.SIG_DFL)
+
+
 def _occupy_closed_streams() -> None:
     """Let no file be opened under the number of a closed stream: what others print would go there.
 
@@ -312,7 +345,7 @@ def check_outputs(
     outputs: Iterable[str | os.PathLike[str] | None],
     traces: Iterable[str] = (),
 ) -> None:
-    """Refuse, before the work, files that would replace what a command reads, or a trace.
+    """Refuse, before the work, files that cannot be written, or would replace what is read.
 
     Args:
         arguments: of which the options that all commands call alike are looked at.
@@ -320,9 +353,9 @@ def check_outputs(
         traces: those it reads, as they were found.
 
     Raises:
-        LaeError: if one is an input, another output or a trace.
+        LaeError: if one is an input, another output or a trace, or cannot be written.
     """
-    from lae_sim.files import check_distinct
+    from lae_sim.files import check_distinct, check_places
     from lae_sim.learning.registry import files_named
     from lae_sim.trace.file import trace_at
 
@@ -338,6 +371,7 @@ def check_outputs(
     for path in written:
         if trace_at(path) is not None:
             raise LaeError(f"{path} is a trace: name another file")
+    check_places(path for path in written if not os.path.isdir(path))
 
 
 def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import add_world, check_outputs, exit_status, new_parser, worlds_of
 from lae_sim.errors import LaeError
+from lae_sim.files import file_names
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.report.film import Scene
 
@@ -89,8 +90,8 @@ def _render(arguments: argparse.Namespace) -> None:
             f"{arguments.trace} has {len(runs)} sequences: choose one with --sequence, or give a "
             "folder as --out"
         )
-    films = [out / f"{run.recording.name.replace('/', '-')}.mp4" for run in runs]
-    if folder:
+    films = [out / name for name in file_names((run.recording.name for run in runs), ".mp4")]
+    if out.is_dir():
         check_outputs(arguments, films)
     sequences = {run.recording.name: _images(run, metadata, arguments) for run in runs}
     camera = Camera(sequences, runs[0].schedule.clock.fps)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -74,12 +73,11 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit status is 1 if a part could not be computed, 2 for bad input."""
     arguments = parser().parse_args(argv)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: no worker stays behind
     failed: list[Failure] = []
     status = exit_status(
         lambda: _study(arguments, failed), PROGRAM, arguments.max_decoded, prints_result=False
     )
-    if status == 130:
+    if status > 128:
         tell("what is finished is kept: the same command goes on from there")
     return status or int(bool(failed))
 

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from fractions import Fraction
 from functools import partial
+from itertools import count
 
 from lae_sim.cli.options import (
     add_worlds,
@@ -16,8 +17,7 @@ from lae_sim.cli.options import (
     print_json,
 )
 from lae_sim.engine.clock import whole
-from lae_sim.files import check_folders
-from lae_sim.progress import print_text
+from lae_sim.progress import ProgressBar, print_text
 
 PROGRAM = "lae-sim train"
 
@@ -67,8 +67,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _train(arguments: argparse.Namespace) -> None:
 
-    from tqdm import tqdm
-
     from lae_sim import __version__
     from lae_sim.cli.options import worlds_of
     from lae_sim.forecast.learned import Learned, write_learned
@@ -79,21 +77,23 @@ def _train(arguments: argparse.Namespace) -> None:
 
     paths = find_traces(arguments.traces)
     check_outputs(arguments, [arguments.out], paths)
-    check_folders([arguments.out])
     worlds = worlds_of(arguments)
     traces = [read_trace(path, arguments.sequence) for path in paths]
     examples = Examples.of_traces(traces, worlds, arguments.exclude)
-    with tqdm(total=arguments.steps, desc="training", unit=" steps", disable=None) as bar:
-        trainer = NetworkTrainer(steps=arguments.steps, progress=bar.update)
+    made = count(1)
+    with ProgressBar("training", "steps") as bar:
+        trainer = NetworkTrainer(
+            steps=arguments.steps, progress=lambda _: bar(next(made), arguments.steps)
+        )
         rule = trainer.fit(examples, arguments.seed).rule
-    made = {
+    origin = {
         "lae_sim": __version__,
         "traces": paths,
         "latencies": arguments.latency,
         "scales": [str(scale) for scale in arguments.latency_scale],
         "policy": arguments.policy,
     }
-    learned = Learned(rule.network, {**rule.document, **made})
+    learned = Learned(rule.network, {**rule.document, **origin})
     write_learned(learned, arguments.out)
     if arguments.json:
         print_json({"forecaster": arguments.out, **learned.document})

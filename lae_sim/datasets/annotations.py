@@ -24,8 +24,8 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats
 from lae_sim.datasets.foreign import HEAD_BYTES, foreign, foreign_columns
 from lae_sim.datasets.numbers import read_lines, read_numbers, read_text
+from lae_sim.decoding import Budget
 from lae_sim.errors import LaeError, listed
-from lae_sim.files import Budget
 
 _PER_SEQUENCE = re.compile(r"groundtruth(?:_rect)?(?:\.([0-9]))?\.txt\Z")
 _NOT_SEQUENCES = ("readme", "list", "license")

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.decoding import TooLargeError
 from lae_sim.errors import LaeError
-from lae_sim.files import TooLargeError
 
 HEAD_BYTES = 1 << 16
 """Of a file, as many are enough for :func:`foreign`."""

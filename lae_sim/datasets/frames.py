@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim.decoding import allowing, within_budget
 from lae_sim.errors import LaeError
-from lae_sim.files import allowing, within_budget
 
 _THREADS = 4
 _PNG = b"\x89PNG\r\n\x1a\n"

@@ -15,8 +15,9 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.datasets.foreign import HEAD_BYTES, foreign
+from lae_sim.decoding import Budget
 from lae_sim.errors import LaeError
-from lae_sim.files import Budget, check_regular
+from lae_sim.files import check_regular
 
 # A cell as a str, and its place in a list.
 _CELL_BYTES = 64
@@ -34,7 +35,7 @@ def read_lines(path: Path) -> list[str]:
 
     Raises:
         LaeError: if the file cannot be read, is empty, looks like another format (it says which),
-            or would take too much memory (see :func:`lae_sim.files.max_decoded`).
+            or would take too much memory (see :func:`lae_sim.decoding.max_decoded`).
     """
     lines = [line.strip() for line in read_text(path, Budget(path)).splitlines()]
     while lines and not lines[-1]:
@@ -57,7 +58,7 @@ def read_cells(
 
     Raises:
         LaeError: if the file cannot be read, is empty, has an empty line inside, is ragged, or
-            would take too much memory (see :func:`lae_sim.files.max_decoded`).
+            would take too much memory (see :func:`lae_sim.decoding.max_decoded`).
     """
     budget = Budget(path)
     rows: list[list[str]] = []

@@ -1,3 +1,4 @@
+from .arrivals import with_arrivals
 from .clock import (
     Clock,
     Number,
@@ -38,4 +39,5 @@ __all__ = [
     "simulate_lanes",
     "split_init",
     "vot_realtime",
+    "with_arrivals",
 ]

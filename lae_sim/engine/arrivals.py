@@ -15,23 +15,37 @@ from lae_sim.engine.clock import MAX_INT64, Clock
 from lae_sim.errors import LaeError, shown
 
 
-def arrival_clock(ticks_per_ns: int, frame_ticks: int, arrival_ns: Ints | Sequence[int]) -> Clock:
-    """See :meth:`.clock.Clock.with_arrivals`; a clock without a table where they are even."""
+def with_arrivals(clock: Clock, arrival_ns: Ints | Sequence[int] | None) -> Clock:
+    """The clock of one sequence whose frames arrive at times of their own.
+
+    Args:
+        clock: of the nominal frame rate.
+        arrival_ns: when each frame arrives, ns after the first one, int64 [T]; None where they
+            arrive evenly.
+
+    Returns:
+        The clock itself where they arrive evenly.
+
+    Raises:
+        LaeError: if they do not ascend from 0, or an instant does not fit in 64-bit ticks.
+    """
+    if arrival_ns is None:
+        return clock
     times = np.asarray(arrival_ns)
     if times.ndim != 1 or not len(times) or times.dtype.kind not in "iu":
         raise LaeError(f"arrival times are whole nanoseconds, one a frame, not {shown(times)}")
     if times[0] != 0 or (times[1:] <= times[:-1]).any():
         raise LaeError("arrival times ascend from 0, that of the first frame")
-    even = Clock(ticks_per_ns, frame_ticks)
-    if max(int(times[-1]) * ticks_per_ns, even.arrival(len(times))) + frame_ticks > MAX_INT64:
+    last = max(int(times[-1]) * clock.ticks_per_ns, clock.arrival(len(times)))
+    if last + clock.frame_ticks > MAX_INT64:
         raise LaeError(
             f"the last frame arrives after {int(times[-1])} ns, beyond 64-bit ticks: check the "
-            f"arrival times, or write the frame rate {even.fps} more simply"
+            f"arrival times, or write the frame rate {clock.fps} more simply"
         )
-    ticks = times.astype(np.int64) * ticks_per_ns
-    if np.array_equal(ticks, even.arrival(np.arange(len(ticks)))):
-        return even
-    return _ArrivalClock(ticks_per_ns, frame_ticks, ticks)
+    ticks = times.astype(np.int64) * clock.ticks_per_ns
+    if np.array_equal(ticks, clock.arrival(np.arange(len(ticks)))):
+        return clock
+    return _ArrivalClock(clock.ticks_per_ns, clock.frame_ticks, ticks)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,8 +104,8 @@ class FrameTime(float):
     """When a frame arrives, in nominal frame intervals after frame 0; as an index, its number.
 
     Example:
-        >>> from lae_sim.engine import Clock
-        >>> clock = Clock.at(25).with_arrivals([0, 40_000_000, 120_000_000])  # one was dropped
+        >>> from lae_sim.engine import Clock, with_arrivals
+        >>> clock = with_arrivals(Clock.at(25), [0, 40_000_000, 120_000_000])  # one was dropped
         >>> frame = clock.frame_time(2)
         >>> frame - 1, ["a", "b", "c"][frame]
         (2.0, 'c')

@@ -18,9 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 from lae_sim.errors import LaeError, shown
 
 if TYPE_CHECKING:  # command lines read numbers before they need NumPy
-    from collections.abc import Sequence
-
-    from lae_sim._arrays import Count, Ints
+    from lae_sim._arrays import Count
 
 NS_PER_SECOND = 10**9
 MAX_INT64 = 2**63 - 1
@@ -198,7 +196,7 @@ class Clock:
 
     Policies ask it when a frame arrives (:meth:`arrival`), which is the newest one (:meth:`newest`)
     and when the stream ends (:meth:`end`), rather than count intervals, and so are right also
-    where frames arrive at times of their own (:meth:`with_arrivals`).
+    where frames arrive at times of their own (:func:`.arrivals.with_arrivals`).
 
     Attributes:
         ticks_per_ns: p, the numerator of the frame rate p/q.
@@ -206,11 +204,11 @@ class Clock:
         is_even: whether frames arrive at equal intervals.
 
     Example:
-        >>> from lae_sim.engine import Clock
+        >>> from lae_sim.engine import Clock, with_arrivals
         >>> clock = Clock.at(30)
         >>> clock.arrival(2) / clock.ticks_per_ns == 2e9 / 30, clock.newest(clock.arrival(2))
         (True, 2)
-        >>> dropped = clock.with_arrivals([0, 33_333_333, 100_000_000])  # one frame never came
+        >>> dropped = with_arrivals(clock, [0, 33_333_333, 100_000_000])  # one frame never came
         >>> dropped.newest(clock.arrival(2)), dropped.end(3) == clock.end(4)
         (1, True)
     """
@@ -230,22 +228,6 @@ class Clock:
         if not isinstance(fps, (Fraction, int)):
             raise LaeError(f"a frame rate must be exact: parse_fps('30000/1001'), not {fps!r}")
         return Clock(fps.numerator, fps.denominator * NS_PER_SECOND)
-
-    def with_arrivals(self, arrival_ns: Ints | Sequence[int] | None) -> Clock:
-        """The clock of one sequence whose frames arrive at times of their own.
-
-        Args:
-            arrival_ns: when each frame arrives, ns after the first one, int64 [T]; None where they
-                arrive evenly.
-
-        Raises:
-            LaeError: if they do not ascend from 0, or an instant does not fit in 64-bit ticks.
-        """
-        if arrival_ns is None:
-            return self
-        from lae_sim.engine.arrivals import arrival_clock
-
-        return arrival_clock(self.ticks_per_ns, self.frame_ticks, arrival_ns)
 
     @property
     def fps(self) -> Fraction:

@@ -10,6 +10,7 @@ Framework", ICCV 2023, Sec. 4); weights over velocities, and training on the ove
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -205,8 +206,10 @@ def write_learned(learned: Learned, path: str | os.PathLike[str]) -> None:
     import torch
 
     document = {"format": FORMAT, "version": VERSION, **learned.document}
+    file = io.BytesIO()  # torch does not say that a disk is full as others do
+    torch.save({**document, "network": learned.network.state_dict()}, file)
     with written_whole(path) as temporary:
-        torch.save({**document, "network": learned.network.state_dict()}, temporary)
+        temporary.write_bytes(file.getvalue())
 
 
 def read_learned(path: str | os.PathLike[str]) -> Windowed[Learned]:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lae_sim.decoding import Budget, TooLargeError
 from lae_sim.errors import LaeError
-from lae_sim.files import Budget, TooLargeError
 
 if TYPE_CHECKING:
     import h5py
@@ -36,7 +36,7 @@ def load_hdf5(path: Path) -> dict[str, Any]:
 
     Raises:
         LaeError: if h5py is not installed, the file is damaged, or larger than any result (see
-            :func:`lae_sim.files.max_decoded`).
+            :func:`lae_sim.decoding.max_decoded`).
     """
     try:
         import h5py

@@ -12,9 +12,9 @@ from typing import Any, NoReturn
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.decoding import within_budget
 from lae_sim.engine.clock import NS_PER_SECOND, Clock
 from lae_sim.errors import LaeError, shown
-from lae_sim.files import within_budget
 from lae_sim.importers.pickles import load_plain
 from lae_sim.replay.run import replay_sequence
 from lae_sim.trace.recording import Recording

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from lae_sim.decoding import Budget
 from lae_sim.errors import LaeError
-from lae_sim.files import Budget
 from lae_sim.importers.hdf5 import load_hdf5
 
 _MAX_DEPTH = 16
@@ -55,8 +55,8 @@ def load_matlab(path: Path) -> dict[str, Any]:
     lists in column order, a struct is a dict. Anything else is None.
 
     Raises:
-        LaeError: if the file is of another version, damaged, or larger than any result (see
-            :func:`lae_sim.files.max_decoded`), or it is of version 7.3 and h5py is not installed.
+        LaeError: if the file is of another version, damaged, or too large
+            (:func:`lae_sim.decoding.max_decoded`), or of version 7.3 and h5py is not installed.
     """
     budget = Budget(path)
     try:

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Floats
+from lae_sim.decoding import json_memory, within_budget
 from lae_sim.errors import LaeError, shown
-from lae_sim.files import json_memory, within_budget
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def load_json(path: Path) -> Any:
 
     Raises:
         LaeError: if it is damaged, or larger than any result (see
-            :func:`lae_sim.files.max_decoded`).
+            :func:`lae_sim.decoding.max_decoded`).
     """
     try:
         within_budget(path, path.stat().st_size)

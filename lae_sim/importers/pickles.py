@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from lae_sim.datasets.foreign import told_apart
+from lae_sim.decoding import Budget, TooLargeError
 from lae_sim.errors import LaeError
-from lae_sim.files import Budget, TooLargeError
 
 _MAX_DEPTH = 32
 # What an operation may leave in memory: an empty dict, the same decoded, and places in lists.

@@ -23,9 +23,9 @@ import numpy as np
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.foreign import HEAD_BYTES, Foreign, foreign, foreign_columns, told_apart
 from lae_sim.datasets.numbers import read_lines, read_numbers, read_text
+from lae_sim.decoding import Budget, within_budget
 from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
 from lae_sim.errors import LaeError, listed, shown
-from lae_sim.files import Budget, within_budget
 from lae_sim.importers.matlab import load_matlab
 from lae_sim.importers.otb import load_json, read_run
 from lae_sim.importers.times import read_times

@@ -1,26 +1,27 @@
 """What a profile has finished so far, kept beside its trace until it is complete.
 
 Every finished sequence is a small trace of its own, written whole or not at all, so that a killed
-run loses no more than the sequence that it was in.
+run loses no more than the sequence that it was in. A sequence may have any name: its file is called
+by a digest of it.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, unquote
 
 from lae_sim.errors import LaeError
-from lae_sim.files import written_whole
+from lae_sim.files import text_digest, written_whole
 from lae_sim.trace.file import Trace, read_trace, validate, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
 _SETTINGS = "settings.json"
+_SEQUENCES = "[0-9a-f]" * 32 + ".parquet"
 
 
 class Journal:
@@ -62,7 +63,7 @@ class Journal:
                 f"not {now.get(key)!r:.200}: "
                 "resume it with the same settings, or remove it"
             )
-        for part in folder.glob("*/[!.]*.parquet"):
+        for part in folder.glob(f"*/{_SEQUENCES}"):
             try:
                 validate(part)
             except LaeError:  # it is run again
@@ -83,43 +84,30 @@ class Journal:
             temporary.write_text(json.dumps(decision), "utf-8")
         return dict(decision)
 
-    def finished(self, name: str) -> list[str]:
-        """The finished sequences of a pass, sorted."""
-        return sorted(unquote(path.stem) for path in (self._folder / name).glob("[!.]*.parquet"))
+    def holds(self, name: str, sequence: str) -> bool:
+        """Whether a sequence of a pass is finished."""
+        return self._file(name, sequence).exists()
 
     def add(
         self, name: str, sequence: str, recordings: Sequence[Recording], metadata: Metadata
     ) -> None:
         """Keep a finished sequence of a pass: one recording, or those of its restarts."""
-        folder = self._folder / name
-        _made(folder)
+        path = self._file(name, sequence)
+        _made(path.parent)
         in_order = sorted(recordings, key=lambda recording: recording.name)
-        write_trace(Trace(metadata, in_order), folder / _file_name(sequence))
+        write_trace(Trace(metadata, in_order), path)
 
-    def metadata(self, name: str) -> list[Metadata]:
-        """What was kept with each finished sequence of a pass."""
-        return [
-            read_trace(self._folder / name / _file_name(sequence)).metadata
-            for sequence in self.finished(name)
-        ]
-
-    def columns(self, name: str) -> frozenset[str]:
-        """The optional columns that any of a pass's recordings has."""
-        parts = [self._folder / name / _file_name(sequence) for sequence in self.finished(name)]
-        return frozenset(column for part in parts for column in read_trace(part).columns)
-
-    def recordings(self, name: str) -> Iterator[Recording]:
-        """The recordings of a pass, sequence by sequence, sorted by name."""
-        for sequence in self.finished(name):
-            yield from read_trace(self._folder / name / _file_name(sequence))
+    def traces(self, name: str) -> list[Trace]:
+        """The finished sequences of a pass, sorted by name."""
+        traces = map(read_trace, (self._folder / name).glob(_SEQUENCES))
+        return sorted(traces, key=lambda trace: trace.names)
 
     def remove(self) -> None:
         """Remove the folder: all of it is in traces now."""
         shutil.rmtree(self._folder)
 
-
-def _file_name(sequence: str) -> str:
-    return quote(sequence, safe=" ").replace(".", "%2E") + ".parquet"
+    def _file(self, name: str, sequence: str) -> Path:
+        return self._folder / name / f"{text_digest(sequence)}.parquet"
 
 
 def _made(folder: Path) -> bool:

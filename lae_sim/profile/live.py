@@ -19,6 +19,7 @@ import numpy as np
 from lae_sim._arrays import Floats, Ints
 from lae_sim.boxes import resized, search_region
 from lae_sim.datasets.frames import Image, ImageSequence
+from lae_sim.engine.arrivals import with_arrivals
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import latest, listed
 from lae_sim.engine.scheduler import Policy, Service, simulate
@@ -165,7 +166,7 @@ class Live:
             )
         if pre_forecaster is not None and not tracker.sets_search:
             raise LaeError("a pre-forecaster needs a tracker whose search can be set: translate it")
-        self.clock = clock.with_arrivals(sequence.arrival_ns)
+        self.clock = with_arrivals(clock, sequence.arrival_ns)
         self._sequence = sequence
         self._tracker = tracker
         self._pre_forecaster = pre_forecaster

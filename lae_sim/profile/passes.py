@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -228,7 +229,6 @@ def run_pass(
         LaeError: if a finished sequence cannot be written.
     """
     failures = []
-    finished = set(journal.finished(task.name))
     cold, read_at = True, -math.inf
     for order, sequence in enumerate(dataset.sequences):
         left = task.work(sequence)
@@ -238,7 +238,7 @@ def run_pass(
             left -= frames
             progress(frames)
 
-        if sequence.name in finished:
+        if journal.holds(task.name, sequence.name):
             advance(left)
             continue
         ready = replace(sequence, read=Buffered(sequence.read, len(sequence)))
@@ -273,7 +273,8 @@ def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> boo
     Raises:
         LaeError: if it cannot be written.
     """
-    kept = [metadata.document for metadata in journal.metadata(task.name)]
+    traces = journal.traces(task.name)
+    kept = [trace.metadata.document for trace in traces]
     if not kept:
         return False
     document = dict(task.metadata.document)
@@ -294,10 +295,10 @@ def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> boo
     measured = sum(entry["measured_ns"] for entry in entries)
     cpu = sum(entry["cpu_ns"] for entry in entries)
     document["timing"] = {**document["timing"], "cpu_share": round(cpu / max(measured, 1), 3)}
-    recordings: Iterable[Recording] = journal.recordings(task.name)
+    recordings: Iterable[Recording] = chain.from_iterable(traces)
     if task.metadata.kind == "restarts":  # "a b" before "a", but "a@1+3" before "a b@1+3"
         recordings = sorted(recordings, key=lambda recording: recording.name)
-    columns = journal.columns(task.name)
+    columns = frozenset(column for trace in traces for column in trace.columns)
     write_trace(Trace(Metadata.of(document), recordings, columns=columns), task.path)
     return True
 

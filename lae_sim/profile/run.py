@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, fields
 from fractions import Fraction
 from functools import partial
@@ -26,7 +26,14 @@ from lae_sim.engine.clock import (
     whole,
 )
 from lae_sim.errors import LaeError, hint, shown
-from lae_sim.files import check_distinct, check_folders, sequence_names
+from lae_sim.files import (
+    NAME_MAX,
+    check_distinct,
+    check_places,
+    locked,
+    sequence_names,
+    text_digest,
+)
 from lae_sim.forecast.camera import Camera
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import files_named, load_forecaster
@@ -290,8 +297,23 @@ def run_profile(
         plan.dataset, plan.root, plan.sequences, plan.box, plan.fps, plan.frame_times
     )
     path = _trace_path(out, f"{plan.tracker}-{dataset.name}")
-    check_folders([str(path)])
-    unfinished = path.with_suffix(".unfinished")
+    check_places([path])
+    _check_names(dataset)
+    with locked(path, f"{path}: another profile"):
+        return _run(plan, dataset, path, resume, force, progress, notice)
+
+
+def _run(
+    plan: ProfilePlan,
+    dataset: Dataset,
+    path: Path,
+    resume: bool,
+    force: bool,
+    progress: Callable[[int, int], object],
+    notice: Callable[[str], object],
+) -> Profile:
+    """The profile of a dataset, while no other writes the trace."""
+    unfinished = _beside(path, ".unfinished")
     if resume and path.exists() and not unfinished.exists():
         metadata = read_trace(path).metadata
         notice(
@@ -299,17 +321,15 @@ def run_profile(
             "remove it to profile anew"
         )
         return Profile((), ())
-    for sequence in dataset.sequences:
-        if fault := text_fault(sequence.name):
-            raise LaeError(f"sequence {sequence.name!r}: the name {fault}: rename it")
     for said in dataset.notes:
         notice(said)
     failures: dict[str, list[Failure]] = {}
-    interrupted = False
+    interrupted: KeyboardInterrupt | None = None
     with closing(_start(plan, notice)) as started:
         with suppress(LaeError):  # a tracker may import libraries, or reach the GPU, only now
             warm_up(started, dataset.sequences[0], min(plan.warmup, 1))
         passes = _passes(plan, dataset, started, path, notice)
+        check_places(each.path for each in passes)
         _check_files(plan, passes, force)
         if path.exists() and not resume:
             notice(f"{path} will be replaced")
@@ -323,17 +343,19 @@ def run_profile(
             done += frames
             progress(done, total)
 
-        try:
-            for task in passes:
-                task.prepare(journal)
-                total = sum(each.work(s) for each in passes for s in dataset.sequences)
-                advance(0)
-                failures[task.name] = run_pass(
-                    task, dataset, started, journal, plan.warmup, advance
-                )
-        except KeyboardInterrupt:
-            interrupted = True
-    written = [task for task in passes if write_pass(task, journal, failures.get(task.name, []))]
+        with _kept(unfinished):
+            try:
+                for task in passes:
+                    task.prepare(journal)
+                    total = sum(each.work(s) for each in passes for s in dataset.sequences)
+                    advance(0)
+                    failures[task.name] = run_pass(
+                        task, dataset, started, journal, plan.warmup, advance
+                    )
+            except KeyboardInterrupt as error:
+                interrupted = error
+    with _kept(unfinished):
+        written = [t for t in passes if write_pass(t, journal, failures.get(t.name, []))]
     if not interrupted:
         journal.remove()
     failed = tuple(failure for each in failures.values() for failure in each)
@@ -345,7 +367,7 @@ def run_profile(
     if interrupted:
         kept = f"{path} holds what is complete; " if written else ""
         notice(f"{kept}--resume goes on")
-        raise KeyboardInterrupt
+        raise interrupted
     if not written:
         raise LaeError("no sequence could be profiled")
     resized = read_trace(written[0].path).metadata.resized
@@ -357,6 +379,15 @@ def run_profile(
     return Profile(tuple(summary(task.path) for task in written), failed)
 
 
+@contextmanager
+def _kept(unfinished: Path) -> Iterator[None]:
+    """Say of an error, such as a full disk, that nothing is lost."""
+    try:
+        yield
+    except LaeError as error:
+        raise LaeError(f"{error}; {unfinished} keeps what is complete: --resume goes on") from error
+
+
 def _trace_path(out: str | os.PathLike[str] | None, name: str) -> Path:
     """The path of the first trace, by default of the name's letters and digits."""
     if out is None:
@@ -364,6 +395,13 @@ def _trace_path(out: str | os.PathLike[str] | None, name: str) -> Path:
     if not str(out).endswith(".parquet"):
         raise LaeError(f"out {out}: call the trace something.parquet")
     return Path(out)
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    """The path with another suffix; under a short name if that were too long."""
+    longer = path.with_suffix(suffix)
+    short = len(os.fsencode(longer.name)) <= NAME_MAX
+    return longer if short else path.with_name(text_digest(path.name) + suffix)
 
 
 def _path(value: Any) -> str:
@@ -554,6 +592,13 @@ def _passes(
         for timing in dict.fromkeys(plan.closed_loops)
     ]
     return passes
+
+
+def _check_names(dataset: Dataset) -> None:
+    """Check that a trace can hold the names of the sequences."""
+    for sequence in dataset.sequences:
+        if fault := text_fault(sequence.name):
+            raise LaeError(f"sequence {shown(sequence.name)}: the name {fault}: rename it")
 
 
 def _check_files(plan: ProfilePlan, passes: Sequence[Pass], force: bool) -> None:

@@ -21,7 +21,7 @@ from typing import IO, Any
 import numpy as np
 
 from lae_sim.datasets.frames import Image
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, described, one_line
 from lae_sim.profile.timed import Answer, TrackerError
 from lae_sim.progress import tell
 from lae_sim.trackers.protocol import checked_frame
@@ -69,9 +69,10 @@ class _Asked(contextlib.AbstractContextManager[Any]):
 class Worker(_Asked):
     """A tracker in a process of its own: a :class:`.timed.TimedTracker`, for ``with``.
 
-    The process stays over sequences. One that crashes or takes too long is ended, with all that it
-    started, and the next `init` starts another. It ends with the thread that started it. What the
-    tracker prints is passed on to the standard error after each answer.
+    The process stays over sequences. One that crashes or takes too long is ended, and the next
+    `init` starts another. It ends with this process, however that ends. With it ends all that it
+    started, but for what has begun a session of its own. What the tracker prints is passed on to
+    the standard error after each answer.
 
     Args:
         tracker: the tracker's name, see `lae_sim.trackers.names.make_tracker`.
@@ -102,6 +103,7 @@ class Worker(_Asked):
         self._timeout, self._setup_timeout = timeout, setup_timeout
         self._process: subprocess.Popen[bytes] | None = None
         self._control: Connection
+        self._lifeline = -1
         self._memory: mmap.mmap | bytes = b""
         self._output = b""
         self._files = contextlib.ExitStack()
@@ -130,9 +132,10 @@ class Worker(_Asked):
     def _start(self) -> None:
         self._kill()
         self._control, workers_end = Pipe()
+        lifeline, self._lifeline = os.pipe()
         limits = {name: str(self._threads) for name in THREAD_VARIABLES if self._threads}
-        with workers_end:
-            inherited = workers_end.fileno(), self._frames.fileno()
+        with workers_end, os.fdopen(lifeline, "rb"):
+            inherited = workers_end.fileno(), self._frames.fileno(), lifeline
             try:
                 self._process = subprocess.Popen(
                     [self._python, str(SERVE), *map(str, inherited)],
@@ -144,7 +147,7 @@ class Worker(_Asked):
                     start_new_session=True,  # Ctrl-C is for this process alone
                 )
             except OSError as error:
-                self._control.close()
+                self._let_go()
                 raise LaeError(f"{self._python} does not start: {error.strerror}") from error
         try:
             self.sets_search = self._exchange("setup", self._setup_timeout, self._setup)
@@ -179,13 +182,17 @@ class Worker(_Asked):
         try:
             with contextlib.suppress(ConnectionError):  # the death is found where answers are read
                 self._control.send_bytes(json.dumps({"do": do, **question}).encode())
-            answer = json.loads(self._received(do, limit))
+            received = self._received(do, limit)
+            try:
+                answer = json.loads(received)
+            except ValueError as error:
+                raise TrackerError(f"{self._tracker}: {do}: sent no answer") from error
         except BaseException:  # with Ctrl-C too: the answer would be taken for that of the next
             self._kill()
             raise
         self._pass_on()
         if "error" in answer:
-            raise TrackerError(f"{self._tracker}: {do}: {answer['error']}")
+            raise TrackerError(f"{self._tracker}: {do}: {one_line(answer['error'])}")
         return answer["answer"]
 
     def _received(self, do: str, limit: float) -> bytes:
@@ -200,21 +207,27 @@ class Worker(_Asked):
             if time.monotonic() >= deadline:
                 raise TrackerError(f"{self._tracker}: {do} exceeded {limit:g} s")
         else:
-            with contextlib.suppress(EOFError, ConnectionError):
+            with contextlib.suppress(EOFError, OSError):
                 return self._control.recv_bytes()
         raise TrackerError(f"{self._tracker}: {do}: {self._cause()}")
 
     def _cause(self) -> str:
         """How the process ended, and its last words."""
+        assert self._process is not None
+        with contextlib.suppress(subprocess.TimeoutExpired):  # its channel is closed first
+            self._process.wait(CLOSE_S)
+        ended = self._process.poll() is not None
         code = self._kill()
         ends = {-s.value: s.name for s in signal.Signals}
         how = f"was ended by {ends.get(code, code)}" if code < 0 else f"exited with status {code}"
-        if code == -signal.SIGKILL:
+        if not ended:
+            how = "closed its channel"
+        elif code == -signal.SIGKILL:
             how += " (out of memory?)"
         words, _, crash = self._output.decode(errors="replace").partition("Fatal Python error")
         place = re.search(r"most recent call first\):\n\s*(File .*)", crash)
         lines = words.split("\n")[-2:-1] + ([place[1]] if place else [])
-        return ": ".join([f"the process {how}"] + [line for line in lines if line])
+        return ": ".join([f"the process {how}", *filter(None, map(one_line, lines))])
 
     def _pass_on(self) -> None:
         """Show what the process printed, and keep the end of it."""
@@ -233,12 +246,17 @@ class Worker(_Asked):
         process, self._process = self._process, None
         if process is None:
             return 0
-        self._control.close()
         with contextlib.suppress(ProcessLookupError, PermissionError):  # they have ended
             os.killpg(process.pid, signal.SIGKILL)
+        self._let_go()
         code = process.wait()
         self._pass_on()
         return code
+
+    def _let_go(self) -> None:
+        """Close what leads to the process."""
+        self._control.close()
+        os.close(self._lifeline)
 
 
 class InProcess(_Asked):
@@ -260,7 +278,12 @@ class InProcess(_Asked):
         self, tracker: str, options: Mapping[str, Any], threads: int | None = None
     ) -> None:
         self._tracker = tracker
-        self._stopwatch = Stopwatch(tracker, options, threads)
+        try:
+            self._stopwatch = Stopwatch(tracker, options, threads)
+        except LaeError:
+            raise
+        except (Exception, SystemExit) as error:  # some scripts exit where they should raise
+            raise LaeError(f"{tracker}: {described(error)}") from error
         self.sets_search = self._stopwatch.sets_search
 
     def _ask(self, do: str, **question: Any) -> Any:
@@ -268,6 +291,8 @@ class InProcess(_Asked):
             return getattr(self._stopwatch, do)(**question)
         except LaeError as error:
             raise TrackerError(f"{self._tracker}: {do}: {error}") from error
+        except (Exception, SystemExit) as error:
+            raise TrackerError(f"{self._tracker}: {do}: {described(error)}") from error
 
 
 def _answer(fields: dict[str, Any]) -> Answer:

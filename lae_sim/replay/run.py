@@ -11,6 +11,7 @@ import numpy as np
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.boxes import PARTED_IOU, iou
+from lae_sim.engine.arrivals import with_arrivals
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.lanes import simulate_lanes
 from lae_sim.engine.policies import latest
@@ -153,7 +154,7 @@ class _Job:
     def clock(self) -> Clock:
         """That of the sequence, which knows when its frames arrive."""
         try:
-            return self.nominal.with_arrivals(self.recording.arrival_ns)
+            return with_arrivals(self.nominal, self.recording.arrival_ns)
         except LaeError as error:
             raise LaeError(f"sequence {self.recording.name!r}: {error}") from error
 

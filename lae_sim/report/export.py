@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
@@ -19,7 +17,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import Observer, ScoredRun
 from lae_sim.evaluation.events import event_log
-from lae_sim.files import written_whole
+from lae_sim.files import NAME_MAX, file_names, staged_folder, written_whole
 from lae_sim.trace.columns import from_numpy
 from lae_sim.trace.recording import BATCH_ROWS
 
@@ -135,30 +133,33 @@ def result_folders(folder: str, names: Mapping[tuple[str, Fraction], str]) -> It
     made = not root.exists()
     try:
         root.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=".part-", dir=root))
     except OSError as error:
         raise LaeError(f"cannot write to {root}: {error.strerror}") from error
     try:
-        for name in names.values():
-            (staging / name).mkdir()
+        with staged_folder(root) as staging:
+            for name in names.values():
+                (staging / name).mkdir()
 
-        def observer(scored: ScoredRun) -> None:
-            sequence = scored.run.recording.name
-            if (
-                sequence != os.path.basename(sequence)
-                or "\0" in sequence
-                or sequence in (".", "..")
-            ):
-                raise LaeError(f"sequence {sequence!r} cannot be the name of a file")
-            for asked, name in names.items():
-                path = staging / name / f"{sequence}.txt"
-                path.write_text(_text(scored.answers[asked].boxes), encoding="ascii")
+            def observer(scored: ScoredRun) -> None:
+                sequence = scored.run.recording.name
+                file = f"{sequence}.txt"
+                if (
+                    sequence != os.path.basename(sequence)
+                    or "\0" in sequence
+                    or sequence in (".", "..")
+                    or len(os.fsencode(file)) > NAME_MAX
+                ):
+                    raise LaeError(f"sequence {sequence!r} cannot be the name of a file")
+                for asked, name in names.items():
+                    path = staging / name / file
+                    if path.exists():  # on a disk that ignores case
+                        raise LaeError(f"{root}: cannot hold {file!r} and another in other case")
+                    path.write_text(_text(scored.answers[asked].boxes), encoding="ascii")
 
-        yield observer
-        for name in names.values():
-            os.replace(staging / name, root / name)
+            yield observer
+            for name in names.values():
+                os.replace(staging / name, root / name)
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
         if made:
             with suppress(OSError):  # it stays if it has come to hold something
                 root.rmdir()
@@ -210,9 +211,10 @@ def result_names(
     stem: str, forecasters: Sequence[str], sigmas: Sequence[Fraction]
 ) -> dict[tuple[str, Fraction], str]:
     """Names of result folders: trace, forecaster, and sigma where it is not 0."""
-    return {
-        (forecaster, sigma): f"{stem}-{forecaster.replace(':', '.')}"
+    asked = [(forecaster, sigma) for forecaster in forecasters for sigma in sigmas]
+    names = [
+        f"{stem}-{forecaster.replace(':', '.')}"
         + (f"-sigma{sigma_text(sigma).replace('/', '_')}" if sigma else "")
-        for forecaster in forecasters
-        for sigma in sigmas
-    }
+        for forecaster, sigma in asked
+    ]
+    return dict(zip(asked, file_names(names)))

@@ -222,25 +222,34 @@ class Scene:
         """
         import cv2
         import numpy as np
-        from tqdm import trange
 
         from lae_sim.files import written_whole
+        from lae_sim.progress import ProgressBar
 
         first = self.draw(0)
         fill = [(0, side % 2) for side in first.shape[:2]] + [(0, 0)]  # codecs need even sides
         height, width = np.pad(first, fill).shape[:2]
         fourcc, rate = cv2.VideoWriter.fourcc(*"mp4v"), float(self.run.schedule.clock.fps)
-        with written_whole(path) as temporary:
+        bar = ProgressBar(Path(path).name, "frames")
+        log = cv2.utils.logging
+        level = log.getLogLevel()
+        with written_whole(path) as temporary, bar:
+            log.setLogLevel(log.LOG_LEVEL_ERROR)  # it warns of each frame that it cannot write
             writer = cv2.VideoWriter(str(temporary), fourcc, rate, (width, height))
             try:
-                for frame in trange(len(self.run), desc=Path(path).name, disable=None):
+                for frame in range(len(self.run)):
                     picture = fitted(self.draw(frame), *first.shape[:2])
                     writer.write(np.pad(picture, fill, "edge"))
+                    bar(frame + 1, len(self.run))
             finally:
                 writer.release()
+                log.setLogLevel(level)
             written = cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)
-            if written != len(self.run):  # the writer is silent on a full disk, or without a codec
-                raise LaeError(f"{path}: only {written:.0f} of {len(self.run)} frames were written")
+            if written != len(self.run):
+                raise LaeError(
+                    f"cannot write {path}: only {max(written, 0):.0f} of {len(self.run)} frames "
+                    "were written: the disk is full, or OpenCV has no codec"
+                )
 
     def strip(self, frames: Sequence[int], width: int = 640) -> Image:
         """Pictures of some frames side by side, each ``width`` pixels wide."""

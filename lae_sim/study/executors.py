@@ -13,8 +13,8 @@ from contextlib import contextmanager, suppress
 from itertools import islice
 from typing import Any, TypeVar
 
+from lae_sim.decoding import allowing
 from lae_sim.errors import LaeError, shown
-from lae_sim.files import allowing
 
 AHEAD = 3
 """Tasks that are handed out for each worker, so that none waits and few results are held."""

@@ -13,11 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from lae_sim.decoding import within_budget
 from lae_sim.engine.clock import exact, parse_duration, parse_fps, split_init, whole
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
-from lae_sim.files import within_budget
 from lae_sim.replay.search import parse_search
 from lae_sim.replay.world import (
     check_sigmas,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lae_sim.errors import LaeError
-from lae_sim.files import text_digest, written_whole
+from lae_sim.files import locked, remove_leftovers, text_digest, written_whole
 from lae_sim.study.cells import Cell, Result
 
 _CELLS = "[0-9a-f]" * 32 + ".parquet"
@@ -40,22 +40,13 @@ class Store:
             LaeError: if one is at work there.
         """
         try:
-            import fcntl
-        except ImportError:  # Windows
-            yield
-            return
-        try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.folder, os.O_RDONLY)
+        except FileExistsError as error:
+            raise LaeError(f"{self.folder}: is there already and is no folder") from error
         except OSError as error:
             raise LaeError(f"{self.folder}: {error.strerror or error}") from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with locked(self.results, f"{self.folder}: another study"):
             yield
-        except BlockingIOError as error:
-            raise LaeError(f"{self.folder}: another study is writing there") from error
-        finally:
-            os.close(descriptor)
 
     def prepare(self, cells: Iterable[Cell]) -> None:
         """Make the folder, bring the cells of the plan back, and set those of others aside.
@@ -66,13 +57,15 @@ class Store:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             folders = (self.results, self._about, self._unused)
-            if any(self.folder.iterdir()) and not all(path.is_dir() for path in folders):
+            seen = [path for path in self.folder.iterdir() if not path.name.startswith(".")]
+            if seen and not all(path.is_dir() for path in folders):
                 raise LaeError(f"{self.folder}: is not empty and not of a study: name another")
             for path in folders:
                 path.mkdir(exist_ok=True)
             for path in (self.folder, *folders):  # before anything is computed for it
                 with tempfile.TemporaryFile(dir=path):
                     pass
+                remove_leftovers(path)
             wanted = {f"{cell.key}.parquet" for cell in cells}
             for path in self.results.glob(_CELLS):
                 if path.name not in wanted:

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lae_sim.decoding import Budget, json_memory
 from lae_sim.errors import LaeError, TraceError, hint, listed, shown
-from lae_sim.files import Budget, json_memory, sequence_names, written_whole
+from lae_sim.files import sequence_names, written_whole
 from lae_sim.trace.checks import COLUMN_TYPES, RowChecker, check_schema
 from lae_sim.trace.columns import BOX, TRUTH, Nullable, Rows, checksums
 from lae_sim.trace.locate import is_url, opened

@@ -1,7 +1,8 @@
 """The worker process: a tracker and its stopwatch, asked through a pipe.
 
-`lae_sim.profile.worker.Worker` runs this file as a script, on the tracker's interpreter, with two
-inherited file descriptors: a pipe, and the memory that frames are handed over in. Questions and
+`lae_sim.profile.worker.Worker` runs this file as a script, on the tracker's interpreter and as the
+leader of a process group, with three inherited file descriptors: a pipe, the memory that frames are
+handed over in, and a second pipe, whose other end is closed when the parent ends. Questions and
 answers are JSON. Whatever the tracker prints goes to the standard error.
 """
 
@@ -23,10 +24,10 @@ FOLDER = os.path.dirname(os.path.abspath(__file__))
 
 def main() -> None:
     """Answer questions until the pipe is closed."""
-    control, frames = (int(argument) for argument in sys.argv[1:])
-    for inherited in (control, frames):
-        os.set_inheritable(inherited, False)  # not for the tracker's own child processes
-    _die_with_parent()
+    control, frames, lifeline = inherited = [int(argument) for argument in sys.argv[1:]]
+    for descriptor in inherited:
+        os.set_inheritable(descriptor, False)  # not for the tracker's own child processes
+    _end_with_parent(lifeline, control)
     _prepare_imports()
     faulthandler.enable()  # a crash says where
     for stream in (sys.stdout, sys.stderr):
@@ -48,24 +49,34 @@ class Server:
 
     def answer(self, question: dict[str, Any]) -> dict[str, Any]:
         """Call the stopwatch's method ``question["do"]``; what it raises becomes an answer."""
-        from lae_sim.errors import LaeError
+        from lae_sim.errors import LaeError, described
 
         do = question.pop("do")
         try:
             if do == "setup":
-                import numpy  # noqa: F401  # here, where its absence can be told, and unmeasured
-
-                from lae_sim.trackers.stopwatch import Stopwatch
-
-                self._stopwatch = Stopwatch(**question)
-                return {"answer": self._stopwatch.sets_search}
+                return {"answer": self._set_up(**question)}
             if "shape" in question:
                 question["frame"] = self._frame(question.pop("shape"))
             return {"answer": getattr(self._stopwatch, do)(**question)}
         except LaeError as error:
             return {"error": str(error)}
-        except ImportError as error:  # of NumPy: the stopwatch explains the tracker's own
-            return {"error": f"{sys.executable}: {error}; it must be Python 3.8+ with NumPy"}
+        except BaseException as error:  # Ctrl-C is the parent's: here it is the tracker's own
+            return {"error": described(error)}
+
+    def _set_up(self, **settings: Any) -> bool:
+        """Make the tracker; whether it can be told where to search."""
+        from lae_sim.errors import LaeError
+
+        try:
+            import numpy  # noqa: F401  # here, where its absence can be told, and unmeasured
+        except ImportError as error:
+            raise LaeError(
+                f"{sys.executable}: {error}; it must be Python 3.8+ with NumPy"
+            ) from error
+        from lae_sim.trackers.stopwatch import Stopwatch
+
+        self._stopwatch = Stopwatch(**settings)
+        return bool(self._stopwatch.sets_search)
 
     def _frame(self, shape: list[int]) -> Any:
         import numpy as np
@@ -76,16 +87,24 @@ class Server:
         return np.frombuffer(self._memory, np.uint8, size).reshape(shape)
 
 
-def _die_with_parent() -> None:
-    """Have the kernel end this process with its parent, even while a tracker hangs (Linux).
+def _end_with_parent(lifeline: int, control: int) -> None:
+    """Leave a process that ends this one, and all that it started, when the parent has ended.
 
-    Elsewhere the end of the pipe does it, as soon as the tracker returns.
+    It waits in the kernel for the parent's end of the lifeline to be closed, and disturbs nothing.
+    A thread could not act while a tracker hangs in C code. It is in this process's group but no
+    child of its, since a tracker may wait for all of its children.
     """
-    if sys.platform.startswith("linux"):
-        with contextlib.suppress(ImportError):  # an interpreter built without ctypes
-            import ctypes
-
-            ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    if os.fork():
+        os.close(lifeline)
+        os.wait()
+        return
+    if os.fork():
+        os._exit(0)
+    os.close(control)  # or the parent would not see this process's end
+    for sent in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(sent, signal.SIG_IGN)
+    os.read(lifeline, 1)
+    os.killpg(os.getpgrp(), signal.SIGKILL)
 
 
 def _prepare_imports() -> None:

@@ -11,12 +11,15 @@ from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter_ns, process_time_ns
 from typing import Any
 
-from lae_sim.errors import LaeError, described
+from lae_sim.errors import LaeError, shown
 from lae_sim.trackers.names import make_tracker
 from lae_sim.trackers.protocol import Image
 
 LARGEST = 1e9
 """The largest number in a box, pixels: what lies beyond is no place in an image."""
+
+LARGEST_SCORE = 3.4e38
+"""Of a float32, in which traces hold scores."""
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """The environment variables that libraries read when they are imported."""
@@ -41,15 +44,16 @@ class Stopwatch:
         sets_search: whether the tracker can be told where to search.
 
     Raises:
-        LaeError: if the tracker cannot be made; by each method, if the tracker raises. After that
-            it must be initialised again.
+        LaeError: if the tracker cannot be made, or answers anything but a box.
+        BaseException: whatever the tracker raises, in each method; after that it must be
+            initialised again.
     """
 
     def __init__(
         self, tracker: str, options: Mapping[str, Any], threads: int | None = None
     ) -> None:
         self._threads = threads
-        self._tracker: Any = _explained(make_tracker, tracker, options)
+        self._tracker: Any = make_tracker(tracker, options)
         for name in ("init", "track"):
             if not callable(getattr(self._tracker, name, None)):
                 raise LaeError(
@@ -63,8 +67,8 @@ class Stopwatch:
     def init(self, frame: Image, box: Sequence[float]) -> dict[str, Any]:
         """Start on a new sequence; what is answered has the fields of `.timed.Answer`."""
         self._started = False
-        _explained(getattr(self._tracker, "prepare", int))
-        _, elapsed_ns, cpu_ns = _explained(self._timed, self._tracker.init, frame.copy(), box)
+        getattr(self._tracker, "prepare", int)()
+        _, elapsed_ns, cpu_ns = self._timed(self._tracker.init, frame.copy(), box)
         self._limit_threads()  # for libraries that the tracker imports only now
         self._started = True
         return {"box": list(box), "score": None, "elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns}
@@ -77,22 +81,14 @@ class Stopwatch:
         if search is not None:
             if not self.sets_search:
                 raise LaeError("the tracker cannot be told where to search: it has no set_search")
-            _explained(self._tracker.set_search, *search)
-        output, elapsed_ns, cpu_ns = _explained(self._timed, self._tracker.track, frame.copy())
-        box, score = _checked(_explained(_plain, output))
+            self._tracker.set_search(*search)
+        output, elapsed_ns, cpu_ns = self._timed(self._tracker.track, frame.copy())
+        box, score = _checked(_plain(output))
         self._started = True
         return {"box": box, "score": score, "elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns}
 
     def describe(self) -> dict[str, Any]:
         """What the tracker says of itself, and its interpreter and libraries, as JSON values."""
-        description: dict[str, Any] = _explained(self._description)
-        return description
-
-    def close(self) -> None:
-        """Have the tracker give its resources back."""
-        _explained(getattr(self._tracker, "close", int))
-
-    def _description(self) -> Any:
         own: Mapping[str, Any] = getattr(self._tracker, "describe", dict)()
         description = {
             **own,
@@ -102,7 +98,12 @@ class Stopwatch:
             "synchronised": self._sync is not _cuda_at_rest or _torch_on_cuda() is not None,
             **_cuda(),
         }
-        return json.loads(json.dumps(description, default=_text))
+        plain: dict[str, Any] = json.loads(json.dumps(description, default=_text))
+        return plain
+
+    def close(self) -> None:
+        """Have the tracker give its resources back."""
+        getattr(self._tracker, "close", int)()
 
     def _timed(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, int, int]:
         self._sync()
@@ -130,16 +131,6 @@ def _cuda_at_rest() -> None:
         torch.cuda.synchronize()
 
 
-def _explained(call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """Call what may raise anything, and say what and where it raised."""
-    try:
-        return call(*arguments, **options)
-    except LaeError:
-        raise
-    except (Exception, SystemExit) as error:  # some scripts exit where they should raise
-        raise LaeError(described(error)) from error
-
-
 def _plain(output: Any) -> Any:
     """Arrays and tensors as lists, lists as tuples, NumPy's numbers as Python's."""
     if isinstance(output, (list, tuple)):
@@ -155,9 +146,18 @@ def _checked(output: Any) -> tuple[list[float] | None, float | None]:
     if box is not None:
         numbers = box if isinstance(box, (list, tuple)) else ()
         if len(numbers) != 4 or not all(_is_number(v) and abs(v) <= LARGEST for v in numbers):
-            raise LaeError(f"answered {repr(output)[:80]}, not a box of four finite numbers")
+            raise LaeError(f"answered {shown(output)}, not a box of four finite numbers")
         box = [float(v) for v in numbers]
-    return box, float(score) if _is_number(score) and math.isfinite(score) else None
+    return box, _score(score)
+
+
+def _score(score: Any) -> float | None:
+    """A score as a trace holds it; None if it is no number, or not a finite one."""
+    if not _is_number(score) or (isinstance(score, float) and not math.isfinite(score)):
+        return None
+    if abs(score) > LARGEST_SCORE:
+        raise LaeError(f"answered the score {shown(score)}, which no float32 holds")
+    return float(score)
 
 
 def _is_number(value: Any) -> bool:

@@ -242,7 +242,10 @@ def test_studies(keys: dict[str, Any], message: str) -> None:
         ({"traces": SLOW, "workers": "x"}, "workers: 'x' is not a whole number"),
         ({"traces": SLOW, "workers": 1, "scheduler": "tcp://x"}, "workers: for this machine"),
         ({"traces": SLOW, "folder": 3}, "folder: a path, not 3"),
-        ({"traces": SLOW, "folder": SLOW}, "synthetic-slow.parquet: File exists"),
+        (
+            {"traces": SLOW, "folder": SLOW},
+            "slow.parquet: is there already and is no folder",
+        ),
         ({"traces": SLOW, "folder": str(TRACES)}, "is not empty and not of a study"),
     ],
 )

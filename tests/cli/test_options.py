@@ -1,4 +1,8 @@
+import os
+import signal
+import time
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +12,7 @@ from lae_sim.cli.main import COMMANDS, main
 from lae_sim.cli.options import exit_status
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.scheduler import scores_latency
+from lae_sim.files import written_whole
 from lae_sim.replay.latency import bootstrap, lognormal, resampled
 from lae_sim.replay.world import parse_latency, parse_policy
 
@@ -136,3 +141,38 @@ def test_every_command_takes_what_a_file_may_take(tmp_path, capsys):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         assert "--max-decoded SIZE" in capsys.readouterr().out
+
+
+POSIX = pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows has no SIGHUP")
+
+
+@POSIX
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_to_end_lets_the_work_clean_up(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    number = getattr(signal, name)
+    before = signal.signal(number, signal.SIG_DFL)  # be it ignored where the tests run
+
+    def work() -> None:
+        with written_whole(tmp_path / "out") as temporary:
+            temporary.write_text("half")
+            os.kill(os.getpid(), number)
+            time.sleep(60)  # which it does not reach
+
+    try:
+        assert exit_status(work, "lae-sim") == 128 + number
+        assert signal.getsignal(number) == signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
+    assert f"lae-sim: ended by {name}" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@POSIX
+def test_a_signal_that_is_ignored_ends_nothing() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as by nohup
+    try:
+        assert exit_status(lambda: os.kill(os.getpid(), signal.SIGHUP), "lae-sim") == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from places import REPOSITORY
 
+from lae_sim.cli.main import main
 from lae_sim.importers.convert import convert_results
 from lae_sim.trace.file import read_trace, write_trace
 
@@ -231,3 +232,33 @@ def test_closed_streams_change_no_status(closed: str, tmp_path: Path) -> None:
         )
         assert done.returncode == status, done.stderr
         assert b"Traceback" not in done.stdout + done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no such pipes")
+@pytest.mark.parametrize(
+    "command",
+    [
+        f"replay {SLOW} --events",
+        f"replay {SLOW} --plot",
+        f"compare {SLOW} --out",
+        f"show {SLOW} --plot",
+        f"fidelity {SLOW} --closed-loop {FAST} --plot",
+        f"render {SLOW} --out",
+        f"train {SLOW} --out",
+        "profile --out",
+        "convert kcf --truth ds --out",
+    ],
+)
+def test_a_pipe_is_refused_before_the_work(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    pipe = "pipe.parquet" if command.startswith(("profile", "compare")) else "pipe.png"
+    os.mkfifo(pipe)
+    assert main([*command.split(), pipe]) == 2
+    error = capsys.readouterr().err
+    assert error.endswith(f"cannot write {pipe}: it is there already and is not a file\n")
+    assert os.listdir() == [pipe]

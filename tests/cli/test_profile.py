@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +19,12 @@ import pytest
 from fakes import bright_frame
 from places import REPOSITORY
 
+from lae_sim.cli.main import main
 from lae_sim.replay.world import replay_trace
 from lae_sim.trace.file import read_trace, validate
 
 TRACKERS = """
-import os, sys, time
+import os, subprocess, sys, time
 import numpy as np
 
 
@@ -46,6 +49,10 @@ class Bright:
                 time.sleep(60)
             if self.how == "exit":
                 os._exit(3)
+            if self.how == "wait":  # with a process of its own
+                with open("child.new", "w") as file:
+                    file.write(str(subprocess.Popen(["sleep", "1004"]).pid))
+                os.rename("child.new", "child")
             while self.how == "wait" and not os.path.exists("go"):
                 time.sleep(0.02)
             if self.how == "wait":
@@ -83,17 +90,22 @@ def make_dataset(root: Path, lengths: dict[str, int], step: float = 2.0) -> Path
 
 
 @pytest.fixture
-def here(tmp_path: Path) -> Path:
-    """A folder with a dataset of three sequences and a module of trackers."""
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with a dataset of three sequences and a module of trackers."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    for module in ("mine", "truth"):  # of another test
+        monkeypatch.delitem(sys.modules, module, raising=False)
     make_dataset(tmp_path / "data", {"a": 20, "bad": 24, "c": 16})
     (tmp_path / "mine.py").write_text(TRACKERS)
     return tmp_path
 
 
-def start(here: Path, *arguments: str, module: str = "profile", **more: Any) -> subprocess.Popen:
+def start(here: Path, *arguments: str, **more: Any) -> subprocess.Popen:
+    """``lae-sim profile`` as a process."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     return subprocess.Popen(
-        [sys.executable, "-W", "error", "-m", "lae_sim", module, *arguments],
+        [sys.executable, "-W", "error", "-m", "lae_sim", "profile", *arguments],
         cwd=here,
         env=environment,
         stdout=subprocess.PIPE,
@@ -103,24 +115,64 @@ def start(here: Path, *arguments: str, module: str = "profile", **more: Any) -> 
     )
 
 
-def heed_ctrl_c() -> None:
-    """In a child: not to ignore Ctrl-C where the tests run in the background of a shell."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def heed_signals() -> None:
+    """In a child: not to ignore Ctrl-C or SIGHUP where the tests run in a shell's background."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
-def profile(here: Path, *arguments: str, status: int = 0, **more: Any) -> tuple[str, str]:
-    process = start(here, *arguments, **more)
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == status, (out, err)
-    assert "Traceback" not in err
-    return out, err
+def ran(command: str, *arguments: str, status: int = 0) -> tuple[str, str]:
+    """What a command prints in this process; trackers have their own all the same."""
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        try:
+            ended = main([command, *arguments])
+        except SystemExit as end:  # of argparse
+            ended = int(end.code or 0)
+    said = out.getvalue(), err.getvalue()
+    assert ended == status, said
+    return said
+
+
+def profile(*arguments: str, status: int = 0) -> tuple[str, str]:
+    """What ``lae-sim profile`` prints."""
+    return ran("profile", *arguments, status=status)
+
+
+def waited_for(path: Path) -> Path:
+    """A file, once it is there."""
+    deadline = time.monotonic() + 60
+    while not path.exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return path
+
+
+def has_ended(number: int) -> bool:
+    """Whether a process ends within a minute."""
+    deadline = time.monotonic() + 60
+    while process_is_there(number) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return not process_is_there(number)
+
+
+def process_is_there(number: int) -> bool:
+    """Whether a process has not ended."""
+    try:
+        os.kill(number, 0)
+        state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
+    except ProcessLookupError:
+        return False
+    except FileNotFoundError:  # it has ended since, or there is no /proc
+        return not Path("/proc/self").exists()
+    return state != "Z"  # whose parent has not asked for it yet
 
 
 MINE = ("--tracker", "mine:Bright", "--root", "data")
 
 
 def test_a_profile_becomes_a_trace_with_its_provenance(here: Path) -> None:
-    out, _ = profile(here, *MINE, "--option", "ms=1.5", "--out", "t.parquet", "--threads", "1")
+    process = start(here, *MINE, "--option", "ms=1.5", "--out", "t.parquet", "--threads", "1")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
     assert "lae-sim replay t.parquet" in out
     validate(here / "t.parquet")
     trace = read_trace(here / "t.parquet")
@@ -147,7 +199,7 @@ def test_a_profile_becomes_a_trace_with_its_provenance(here: Path) -> None:
 def test_json_says_the_same(here: Path) -> None:
     passes = ("--stride", "2", "--stride", "3", "--closed-loop", "constant:0.5ms")
     passes += ("--closed-loop", "constant:0.5ms,init=1s")
-    out, _ = profile(here, *MINE, "--sequence", "a", "--json", "--in-process", *passes)
+    out, _ = profile(*MINE, "--sequence", "a", "--json", "--in-process", *passes)
     report = json.loads(out)
     assert [trace["trace"] for trace in report["traces"]] == [
         "mine-Bright-data.parquet",
@@ -174,7 +226,7 @@ def test_json_says_the_same(here: Path) -> None:
 )
 def test_a_failing_tracker_costs_its_sequence(here: Path, how: str, reason: str) -> None:
     options = ("--option", "fail_at=9", f"how={how}", "--frame-timeout", "600ms")
-    out, err = profile(here, *MINE, *options, "--out", "t.parquet", "--json", status=1)
+    out, err = profile(*MINE, *options, "--out", "t.parquet", "--json", status=1)
     (failure,) = json.loads(out)["failures"]
     assert failure["sequence"] == "bad"
     import re
@@ -187,9 +239,7 @@ def test_a_failing_tracker_costs_its_sequence(here: Path, how: str, reason: str)
 
 
 def test_a_frame_without_an_answer_costs_that_frame(here: Path) -> None:
-    out, _ = profile(
-        here, *MINE, "--option", "fail_at=9", "how=none", "--out", "t.parquet", "--json"
-    )
+    out, _ = profile(*MINE, "--option", "fail_at=9", "how=none", "--out", "t.parquet", "--json")
     assert json.loads(out)["traces"][0]["lost"] == 1
     trace = read_trace(here / "t.parquet")
     bad = {recording.name: recording for recording in trace}["bad"]
@@ -198,8 +248,8 @@ def test_a_frame_without_an_answer_costs_that_frame(here: Path) -> None:
 
 
 def test_real_time_skips_frames_and_replays_to_the_bit(here: Path) -> None:
-    options = ("--mode", "real-time", "--option", "ms=50", "--out", "t.parquet")
-    profile(here, *MINE, *options, "--sequence", "a")
+    options = ("--mode", "real-time", "--option", "ms=50", "--out", "t.parquet", "--warmup", "0")
+    profile(*MINE, *options, "--sequence", "a")
     trace = read_trace(here / "t.parquet")
     assert trace.metadata.kind == "real-time"
     (run,) = replay_trace(trace)
@@ -225,7 +275,7 @@ def test_the_closed_loop_by_search_and_by_translation(here: Path) -> None:
             "    def update(self, frame, box): pass\n"
             "    def predict(self, frame): return [5 + 5 * frame, 20, 12, 10]\n"
         )
-        out, _ = profile(here, *options, *shared, "--out", f"{name}.parquet", "--json")
+        out, _ = profile(*options, *shared, "--out", f"{name}.parquet", "--json")
         report = json.loads(out)["traces"][0]
         lost[name] = report["lost"]
         schedule = read_trace(here / f"{name}.parquet").metadata.document["schedule"]
@@ -235,62 +285,70 @@ def test_the_closed_loop_by_search_and_by_translation(here: Path) -> None:
 
 
 def test_another_devices_trace_drives_the_schedule(here: Path) -> None:
-    profile(here, *MINE, "--option", "ms=90", "--sequence", "a", "--out", "slow.parquet")
-    profile(here, *MINE, "--timing", "slow.parquet", "--sequence", "a", "--out", "t.parquet")
+    cold = ("--warmup", "0")
+    profile(*MINE, "--option", "ms=70", "--sequence", "a", "--out", "slow.parquet", *cold)
+    profile(*MINE, "--timing", "slow.parquet", "--sequence", "a", "--out", "t.parquet", *cold)
     (slow,), (run,) = (
         read_trace(here / "slow.parquet"),
         replay_trace(read_trace(here / "t.parquet")),
     )
     frames = run.schedule.frames
-    assert len(frames) < 10
+    assert len(frames) < 12
     np.testing.assert_array_equal(run.recording.elapsed_ns[frames], slow.elapsed_ns[frames])
-    _, err = profile(here, *MINE, "--timing", "slow.parquet", status=1)
+    _, err = profile(*MINE, "--timing", "slow.parquet", status=1)
     assert "no times of sequence 'bad'" in err
 
 
+WAITS = ("--option", "fail_at=1", "how=wait")  # in the second sequence, until told to go on
+WAITING = (*MINE, *WAITS, "--out", "t.parquet", "--frame-timeout", "600s", "--warmup", "0")
+
+
 def test_kill_and_resume(here: Path) -> None:
-    options = (*MINE, "--option", "ms=20", "--out", "t.parquet", "--warmup", "0")
+    options = WAITING
     process = start(here, *options)
-    kept = here / "t.unfinished" / "first"
-    deadline = time.monotonic() + 60
-    while not list(kept.glob("[!.]*.parquet")) and time.monotonic() < deadline:
-        time.sleep(0.01)
+    child = int(waited_for(here / "child").read_text())
     process.kill()
     process.communicate()
-    before = {path.name: path.stat().st_mtime_ns for path in kept.glob("[!.]*.parquet")}
-    assert before
+    assert has_ended(child)
+    kept = here / "t.unfinished" / "first"
+    assert [read_trace(path).names for path in kept.iterdir()] == [("a",)]
     assert not (here / "t.parquet").exists()
-    _, err = profile(here, *options, status=2)
+    (here / "go").touch()
+    _, err = profile(*options, status=2)
     assert "--resume" in err
-    _, err = profile(here, *options[:-1], "1", "--resume", status=2)
+    _, err = profile(*options[:-1], "1", "--resume", status=2)
     assert "warmup" in err
-    _, err = profile(here, *options, "--tracker", "mine:Searching", "--resume", status=2)
+    _, err = profile(*options, "--tracker", "mine:Searching", "--resume", status=2)
     assert "tracker 'mine:Bright', not 'mine:Searching'" in err
-    process = start(here, *options, "--resume")
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    profile(*options, "--resume")
     assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a", "bad", "c"]
     assert not kept.parent.exists()
-    _, err = profile(here, *options, "--resume")
+    assert not list(here.glob(".*"))  # what the killed one had locked
+    _, err = profile(*options, "--resume")
     assert "complete" in err
 
 
-def test_ctrl_c_keeps_what_is_complete(here: Path) -> None:
-    waits = ("--option", "fail_at=1", "how=wait")  # in the second sequence, until told to go on
-    options = (*MINE, *waits, "--out", "t.parquet", "--warmup", "0", "--frame-timeout", "600s")
-    process = start(here, *options, start_new_session=True, preexec_fn=heed_ctrl_c)
-    deadline = time.monotonic() + 60
-    while not list(here.glob("t.unfinished/first/[!.]*.parquet")) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGINT)
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_what_ends_a_profile_keeps_what_is_complete(here: Path, end: signal.Signals) -> None:
+    options = WAITING
+    process = start(here, *options, start_new_session=True, preexec_fn=heed_signals)
+    child = int(waited_for(here / "child").read_text())
+    assert process_is_there(child)
+    for more in ((), ("--resume",)):
+        _, err = profile(*options, *more, status=2)
+        assert f"another profile is at work there (process {process.pid} on " in err
+    os.killpg(process.pid, end)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 130, err
+    assert process.returncode == 128 + end, err
     assert "Traceback" not in err
     assert "--resume" in err
     assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a"]
-    (here / "go").touch()
-    profile(here, *options, "--resume")
-    assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a", "bad", "c"]
+    assert has_ended(child)
+    if end == signal.SIGINT:
+        (here / "go").touch()
+        profile(*options, "--resume")
+        assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a", "bad", "c"]
+        assert not list(here.glob(".*"))
 
 
 def test_a_full_disk_is_an_error_and_leaves_no_trace(here: Path) -> None:
@@ -300,11 +358,20 @@ def test_a_full_disk_is_an_error_and_leaves_no_trace(here: Path) -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 
-    _, err = profile(
-        here, *MINE, "--out", "t.parquet", "--in-process", status=2, preexec_fn=little_space
-    )
+    options = (*MINE, "--out", "t.parquet", "--in-process")
+    process = start(here, *options, preexec_fn=little_space)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 2, err
+    assert "Traceback" not in err
     assert "cannot write" in err
+    assert "File too large" in err
+    assert "t.unfinished keeps what is complete: --resume goes on" in err
     assert not (here / "t.parquet").exists()
+    assert not list(here.rglob("*.part*"))
+    process = start(here, *options, "--resume")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert read_trace(here / "t.parquet").names == ("a", "bad", "c")
 
 
 @pytest.mark.parametrize(
@@ -333,7 +400,7 @@ def test_a_full_disk_is_an_error_and_leaves_no_trace(here: Path) -> None:
 def test_bad_input_is_one_clear_error(here: Path, arguments: tuple[str, ...], message: str) -> None:
     import re
 
-    _, err = profile(here, *arguments, status=2)
+    _, err = profile(*arguments, status=2)
     assert re.search(message, err.replace("\n", " ")), err
     assert not list(here.glob("*.parquet"))
     assert not list(here.glob("*.unfinished"))
@@ -341,7 +408,7 @@ def test_bad_input_is_one_clear_error(here: Path, arguments: tuple[str, ...], me
 
 def test_an_unreadable_image_costs_its_sequence(here: Path) -> None:
     (here / "data" / "bad" / "img" / "0012.png").write_bytes(b"not an image")
-    out, err = profile(here, *MINE, "--json", status=1)
+    out, err = profile(*MINE, "--json", status=1)
     (failure,) = json.loads(out)["failures"]
     assert "0012.png" in failure["reason"]
     assert "'bad', frame 11" in err
@@ -368,12 +435,10 @@ def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
         "constant:47ms",
         "constant:100ms",
     )
-    out, _ = profile(here, *options, *loops)
+    out, _ = profile(*options, *loops)
     command = next(line for line in out.splitlines() if "lae-sim fidelity" in line)
     arguments = command.split()[2:]
-    process = start(here, *arguments, "--json", "--forecaster", "hold", "kalman", module="fidelity")
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    out, _ = ran("fidelity", *arguments, "--json", "--forecaster", "hold", "kalman")
     rows = {
         (row["closed_loop"], row["replay"]): row
         for row in json.loads(out)["summary"]
@@ -386,47 +451,30 @@ def test_fidelity_measures_replays_against_the_closed_loop(here: Path) -> None:
     assert rows["t.closed-loop-100ms.parquet", "strided"]["max_abs_d_auc"] == 0
     # a target that goes 9 pixels in three frames is lost by a tracker that reaches 8
     assert rows["t.closed-loop-100ms.parquet", "every-frame"]["mean_abs_d_dp20"] > 0.2
-    process = start(here, *arguments, "--per-sequence", module="fidelity")
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    out, _ = ran("fidelity", *arguments, "--per-sequence")
     assert "strided" in out
     assert out.splitlines()[-1].startswith("Modelled replays of bright are within 0.")
     passes = ("--strided", "t.stride2.parquet", "t.stride3.parquet")
     slow = ("--latency", "constant:47ms", "--json", "--per-sequence")
-    process = start(here, "t.parquet", *passes, *slow, module="replay")
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    out, _ = ran("replay", "t.parquet", *passes, *slow)
     (report,) = json.loads(out)["traces"]
     assert report["strided"] == list(passes[1:])
     # steps of 1 and 2 by turns are nearest to every frame, and the tracker answers alike
     for row in report["results"][0]["per_sequence"]:
         assert row["disagreement"] == 0 < row["approximate_outputs"]
     assert not report["exact"]
-    profile(here, *options[:-1], "u.parquet", "--option", "reach=9")
-    process = start(here, "u.parquet", *arguments[1:], module="fidelity")
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 2
+    profile(*options[:-1], "u.parquet", "--option", "reach=9")
+    _, err = ran("fidelity", "u.parquet", *arguments[1:], status=2)
     assert "same tracker" in err
-    process = start(here, "t.parquet", "--closed-loop", "t.parquet", module="fidelity")
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 2
+    _, err = ran("fidelity", "t.parquet", "--closed-loop", "t.parquet", status=2)
     assert "no closed loop" in err
-
-
-def ran(here: Path, *arguments: str, status: int = 0) -> tuple[str, str]:
-    module, *rest = arguments
-    process = start(here, *rest, module=module)
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == status, (out, err)
-    assert "Traceback" not in err
-    return out, err
 
 
 def test_a_gap_pass_goes_beside_the_other_passes(here: Path) -> None:
     make_dataset(here / "fast", {"a": 40, "c": 40}, step=3)
     mine = ("--tracker", "mine:Bright", "--root", "fast", "--option", "reach=8")
     passes = ("--stride", "2", "--gaps", "--closed-loop", "constant:47ms")
-    out, _ = profile(here, *mine, *passes, "--out", "t.parquet")
+    out, _ = profile(*mine, *passes, "--out", "t.parquet")
     strided = "--strided t.stride2.parquet t.gaps.parquet"
     replay = f"lae-sim replay t.parquet {strided}"
     fidelity = f"lae-sim fidelity t.parquet {strided} --closed-loop t.closed-loop-47ms.parquet"
@@ -436,17 +484,17 @@ def test_a_gap_pass_goes_beside_the_other_passes(here: Path) -> None:
     validate(here / "t.gaps.parquet")
 
     slow = ("--latency", "constant:47ms", "--json")
-    with_gaps, _ = ran(here, *replay.split()[1:], *slow)
-    without, _ = ran(here, *replay.split()[1:-1], *slow)
+    with_gaps, _ = ran(*replay.split()[1:], *slow)
+    without, _ = ran(*replay.split()[1:-1], *slow)
     both = [json.loads(text)["traces"][0]["results"] for text in (with_gaps, without)]
     assert [row["auc"] for row in both[0]] == [row["auc"] for row in both[1]]
-    ran(here, *replay.split()[1:], "--sequence", "a")
-    ran(here, "replay", "t.parquet", "--strided", "t.gaps.parquet", *slow)
-    rows, _ = ran(here, *fidelity.split()[1:], "--json")
+    ran(*replay.split()[1:], "--sequence", "a")
+    ran("replay", "t.parquet", "--strided", "t.gaps.parquet", *slow)
+    rows, _ = ran(*fidelity.split()[1:], "--json")
     assert {row["replay"] for row in json.loads(rows)["summary"]} >= {"every-frame", "strided"}
 
     for command in ("replay", "compare"):
-        _, err = ran(here, command, "t.gaps.parquet", status=2)
+        _, err = ran(command, "t.gaps.parquet", status=2)
         assert err.count("\n") == 1
         assert "a gap pass" in err
         assert "--strided" in err
@@ -454,28 +502,28 @@ def test_a_gap_pass_goes_beside_the_other_passes(here: Path) -> None:
         ("--timing", "t.gaps.parquet", "a gap pass has no times"),
         ("--strided", "t.closed-loop-47ms.parquet", "a real-time trace is no pass"),
     ):
-        _, err = ran(here, "replay", "t.parquet", option, pass_, status=2)
+        _, err = ran("replay", "t.parquet", option, pass_, status=2)
         assert message in err
 
-    said, _ = ran(here, "show", "t.gaps.parquet")
+    said, _ = ran("show", "t.gaps.parquet")
     assert "reach        centre" in said
     # it looks 8 pixels around, and 3 a frame are 9 at the third
     assert "found up to gap" not in said
     assert "lost from gap 3 on" in said
-    shown, _ = ran(here, "show", "t.gaps.parquet", "t.parquet", "--json")
+    shown, _ = ran("show", "t.gaps.parquet", "t.parquet", "--json")
     gaps, every = json.loads(shown)["traces"]
     side = 22.0  # of 12 x 10 pixels
     assert gaps["reach"]["centre"] == pytest.approx(8 / side, abs=0.1)
     assert "reach" not in every
-    ran(here, "show", "t.gaps.parquet", "--plot", "reach.png")
+    ran("show", "t.gaps.parquet", "--plot", "reach.png")
     assert (here / "reach.png").stat().st_size > 10_000
-    _, err = ran(here, "show", "t.gaps.parquet", "t.parquet", "--plot", "x.png", status=2)
+    _, err = ran("show", "t.gaps.parquet", "t.parquet", "--plot", "x.png", status=2)
     assert "one by one" in err
 
 
 def test_where_only_restarts_are_left_they_are_what_comes_next(here: Path) -> None:
     bad = ("--option", "fail_at=20", "--sequence", "bad", "--out", "t.parquet")  # of 23 calls
-    out, _ = profile(here, *MINE, *bad, "--gaps", status=1)
+    out, _ = profile(*MINE, *bad, "--gaps", status=1)
     assert not (here / "t.parquet").exists()
     assert out.partition("next:\n")[2] == "  lae-sim show t.gaps.parquet --plot reach.png\n"
 
@@ -483,7 +531,7 @@ def test_where_only_restarts_are_left_they_are_what_comes_next(here: Path) -> No
 def test_a_tracker_that_declares_no_search_region(here: Path) -> None:
     text = TRACKERS.replace('"version": "1",', '"version": "1", "search": {"half_side": "big"},')
     (here / "mine.py").write_text(text)
-    _, err = profile(here, *MINE, status=2)
+    _, err = profile(*MINE, status=2)
     assert "mine:Bright: what describe() says does not fit a trace" in err
     assert "tracker.search.half_side" in err
     assert "such as 1.0" in err

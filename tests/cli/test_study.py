@@ -763,8 +763,10 @@ def test_files_of_alike_names_keep_apart(tmp_path: Path) -> None:
 def test_a_folder_has_one_study_at_a_time(tmp_path: Path) -> None:
     from lae_sim.study.store import Store
 
-    with Store(tmp_path).locked(), pytest.raises(LaeError, match="another study is writing there"):
+    message = f"another study is at work there .process {os.getpid()} on .*wait"
+    with Store(tmp_path).locked(), pytest.raises(LaeError, match=message):
         run(tmp_path)
+    assert not list(tmp_path.iterdir())
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "mine.parquet").write_text("mine")
     with pytest.raises(LaeError, match="not of a study"):

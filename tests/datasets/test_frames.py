@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from lae_sim.datasets.frames import Buffered, Video, read_image
+from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError
-from lae_sim.files import max_decoded
 
 cv2 = pytest.importorskip("cv2", reason="frames are decoded with OpenCV")
 

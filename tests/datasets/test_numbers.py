@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from lae_sim.datasets.numbers import read_numbers
+from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError
-from lae_sim.files import max_decoded
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lae_sim
+from lae_sim.engine.arrivals import with_arrivals
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import latest, vot_realtime
 from lae_sim.engine.scheduler import Schedule, simulate
@@ -38,7 +39,7 @@ RATE = Fraction(10**9, 7)
 
 
 def schedule_of(world: Arriving, policy: str = "latest") -> Schedule:
-    clock = Clock.at(world.fps).with_arrivals(world.arrival_ns)
+    clock = with_arrivals(Clock.at(world.fps), world.arrival_ns)
     times = world.elapsed_ns.__getitem__
     return simulate(len(world.arrival_ns), clock, times, POLICIES[policy])
 
@@ -162,7 +163,7 @@ KEPT = np.array([i for i in range(40) if i % 4 != 2 and i not in (20, 21)])
 
 def processing(times: Recording, frames: list[int]) -> Run:
     """A run which processes these frames, each as it arrives, at no time."""
-    clock = Clock.at(Fraction(25)).with_arrivals(times.arrival_ns)
+    clock = with_arrivals(Clock.at(Fraction(25)), times.arrival_ns)
     ticks = np.array([clock.arrival(frame) for frame in frames])
     schedule = Schedule(clock, len(times), np.array(frames), ticks, ticks)
     return Run(times, schedule, times.boxes[frames], 0)

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError
-from lae_sim.files import max_decoded
 from lae_sim.importers.matlab import load_matlab
 from lae_sim.importers.results import Source, read_results
 

@@ -27,8 +27,8 @@ import scipy.io
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError
-from lae_sim.files import max_decoded
 from lae_sim.importers.convert import convert_results
 from lae_sim.importers.times import UNITS
 from lae_sim.study.spec import read_study

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lae_sim.decoding import max_decoded
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
-from lae_sim.files import max_decoded
 from lae_sim.importers.lae_pvt import read_run
 from lae_sim.replay.run import replay_sequence
 

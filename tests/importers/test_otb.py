@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError
-from lae_sim.files import max_decoded
 from lae_sim.importers.otb import load_json, read_run
 
 SQUARE = np.array([[10, 50, 50, 10], [20, 20, 60, 60]], float)  # x and y of its corners

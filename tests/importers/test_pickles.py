@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError
-from lae_sim.files import max_decoded
 from lae_sim.importers.pickles import load_plain
 
 

@@ -14,8 +14,8 @@ import scipy.io
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError
-from lae_sim.files import max_decoded
 from lae_sim.importers.pickles import load_plain
 from lae_sim.importers.results import Source, find_results, given_times, read_results
 

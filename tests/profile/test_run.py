@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
 from fractions import Fraction
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from fakes import bright_frame
 
 from lae_sim.api.evaluation import evaluate
 from lae_sim.comparison.fidelity import compare_closed_loops, summarise_closed_loops
@@ -18,7 +21,20 @@ from lae_sim.profile.passes import Failure
 from lae_sim.profile.run import Profile, ProfilePlan, profile_tracker, run_profile
 from lae_sim.trace.file import read_trace
 
-QUICK = {"sequences": ["race"], "in_process": True, "warmup": 0}
+LENGTH = 20
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Settings of a quick profile, of a short sequence of small images."""
+    root = tmp_path_factory.mktemp("data")
+    folder = root / "race" / "img"
+    folder.mkdir(parents=True)
+    for i in range(LENGTH):
+        cv2.imwrite(str(folder / f"{i + 1:04}.png"), bright_frame(5 + 2 * i, 20, size=(80, 64)))
+    boxes = [f"{5 + 2 * i},20,12,10\n" for i in range(LENGTH)]
+    (root / "race" / "groundtruth_rect.txt").write_text("".join(boxes))
+    return {"root": root, "in_process": True, "warmup": 0}
 
 
 def test_text_and_numbers_make_a_plan() -> None:
@@ -55,13 +71,13 @@ def test_settings_that_cannot_be(settings: dict[str, Any], message: str) -> None
         ProfilePlan.of(**settings)
 
 
-def test_passes_progress_and_closed_loops(tmp_path: Path) -> None:
+def test_passes_progress_and_closed_loops(tmp_path: Path, quick: dict[str, Any]) -> None:
     progress: list[tuple[int, int]] = []
     notices: list[str] = []
     out = tmp_path / "t.parquet"
     out.write_bytes(b"")
     profile = run_profile(
-        ProfilePlan.of(tracker="dcf", closed_loops=["constant:100ms"], **QUICK),
+        ProfilePlan.of(tracker="dcf", closed_loops=["constant:100ms"], **quick),
         out,
         progress=lambda done, total: progress.append((done, total)),
         notice=notices.append,
@@ -90,9 +106,11 @@ def test_passes_progress_and_closed_loops(tmp_path: Path) -> None:
     assert "nothing to resume" in notices[0]
 
 
-def test_a_profile_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_profile_in_one_call(
+    tmp_path: Path, quick: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "t.parquet"
-    settings = {"sequences": "race", "in_process": True, "warmup": "0", "strides": 1.5}
+    settings = {**quick, "sequences": "race", "warmup": "0", "strides": 1.5}
     profile = profile_tracker("dcf", out=out, fps=29.97, **settings)
     assert capsys.readouterr() == ("", "")  # nobody looks
     first, strided = profile.traces
@@ -112,14 +130,14 @@ def test_a_profile_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_a_profile_shows_its_progress_and_says_what_to_know(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, quick: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "t.parquet"
-    profile_tracker("dcf", out=out, progress=True, **QUICK)
+    profile_tracker("dcf", out=out, progress=True, **quick)
     said, shown = capsys.readouterr()
     assert said == ""
-    assert "160/160" in shown
-    again = profile_tracker("dcf", out=out, progress=True, resume=True, **QUICK)
+    assert f"{LENGTH:.1f}/{LENGTH:.1f}" in shown
+    again = profile_tracker("dcf", out=out, progress=True, resume=True, **quick)
     assert "nothing to resume" in capsys.readouterr().err
     assert repr(again) == "<Profile: nothing was left to do>"
 
@@ -194,7 +212,11 @@ def test_flags_of_absence_are_profiled(tmp_path: Path, monkeypatch: pytest.Monke
     ],
 )
 def test_what_a_tracker_says_of_itself_must_fit_a_trace(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str, problem: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    quick: dict[str, Any],
+    said: str,
+    problem: str,
 ) -> None:
     (tmp_path / "odd.py").write_text(
         "class Odd:\n"
@@ -208,7 +230,7 @@ def test_what_a_tracker_says_of_itself_must_fit_a_trace(
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "odd", raising=False)
     with pytest.raises(LaeError, match=r"^odd:Odd: what describe\(\) says") as caught:
-        run_profile(ProfilePlan.of(tracker="odd:Odd", **QUICK), tmp_path / "t.parquet")
+        run_profile(ProfilePlan.of(tracker="odd:Odd", **quick), tmp_path / "t.parquet")
     assert problem in str(caught.value)
     assert sorted(path.name for path in tmp_path.glob("t.*")) == []
 
@@ -223,3 +245,17 @@ def test_a_sequence_that_no_trace_can_name_is_refused_before_anything_is_run(
     plan = ProfilePlan.of(root=tmp_path / "data", in_process=True)
     with pytest.raises(LaeError, match=r"the name holds the control character .*: rename it"):
         run_profile(plan, tmp_path / "t.parquet")
+
+
+def test_a_name_that_no_trace_can_hold_is_refused_before_the_work(
+    tmp_path: Path, quick: dict[str, Any]
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(quick["root"], root)
+    try:
+        os.rename(os.fsencode(root / "race"), os.fsencode(root) + b"/bad\xff")
+    except OSError:
+        pytest.skip("this disk has names of Unicode text only")
+    with pytest.raises(LaeError, match=r"sequence 'bad.udcff': the name is not Unicode text"):
+        profile_tracker("dcf", out=tmp_path / "t.parquet", **{**quick, "root": root})
+    assert os.listdir(tmp_path) == ["data"]

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from witness import BOX, MINIMAL, TRUTH, TYPES, assert_same, columns_of, moving, same, write_plain
 
 import lae_sim.trace.file
+from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError, TraceError
-from lae_sim.files import max_decoded
 from lae_sim.trace.file import Trace, read_trace, validate, write_trace
 from lae_sim.trace.locate import digest
 from lae_sim.trace.metadata import Metadata
