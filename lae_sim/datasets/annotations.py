@@ -471,6 +471,8 @@ def _from_csv(path: Path, sequences: Iterable[str]) -> dict[str, tuple[str, ...]
         header, *rows = csv.reader(io.StringIO(read_text(path, Budget(path)), newline=""))
     except (ValueError, csv.Error) as error:
         raise LaeError(f"{path}: not a table of attributes: {error}") from error
+    if not header:
+        raise LaeError(f"{path}, line 1: needs a header: sequence, and the attributes' names")
     known = set(sequences)
     attributes = {}
     for number, row in enumerate(rows, 2):

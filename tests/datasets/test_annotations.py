@@ -368,3 +368,12 @@ def test_real_datasets(shared_data, dataset, sequences, frames, attributes):
     found = read_attributes(truth).of
     assert len(found) == (sequences if attributes else 0)
     assert len({name for names in found.values() for name in names}) == attributes
+
+
+def test_attributes_without_a_header_are_left_out(tmp_path):
+    make(tmp_path, "a.txt", text="1,2,3,4\n")
+    make(tmp_path, "attributes.csv", text="\n\n")
+    (note,) = read_attributes(find_truth(tmp_path)).notes
+    assert note.endswith(
+        "attributes.csv, line 1: needs a header: sequence, and the attributes' names"
+    )

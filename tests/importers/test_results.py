@@ -278,7 +278,7 @@ def test_a_mat_bomb_takes_no_memory(tmp_path):
         "import resource, sys; from pathlib import Path\n"
         "from lae_sim.importers.matlab import load_matlab\n"
         "from lae_sim.errors import LaeError\n"
-        "from lae_sim.files import max_decoded\n"
+        "from lae_sim.decoding import max_decoded\n"
         "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10\n"
         "before = peak()\n"
         "try:\n"
