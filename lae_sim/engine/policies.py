@@ -71,7 +71,8 @@ class _Latest(_ByLastCall):
         newest = clock.newest(now)
         if newest > last:
             return newest, now
-        return last + 1, clock.arrival(last + 1)
+        following = last + 1
+        return following, clock.arrival(following)
 
     def next_lanes(self, clock: Clock, last: Count, now: Count) -> Count:
         return _later(clock.newest(now), last + 1)

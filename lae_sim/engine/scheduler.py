@@ -135,9 +135,8 @@ def _tracker(
     calls: list[Call],
 ) -> Generator[simpy.Event, Any, None]:
     """The tracker as a SimPy process with one timeout for each frame that it processes."""
-    ticks_per_ns, interval = clock.ticks_per_ns, clock.frame_ticks
-    even = clock.is_even  # where asking the clock for each arrival would cost 3 % of the whole
-    end = clock.end(length)
+    ticks_per_ns, end = clock.ticks_per_ns, clock.end(length)
+    arrival, timeout = clock.arrival, environment.timeout
     frame = start = 0
     while True:
         elapsed_ns = index(service(frame))
@@ -147,12 +146,10 @@ def _tracker(
         following, begin = policy(clock, calls)
         if following >= length or begin >= end:
             return
-        arrival = following * interval if even else clock.arrival(following)
-        if following <= frame or begin < start or begin < arrival:
-            ask = "" if clock.is_even else "; clock.arrival and clock.newest know the arrivals"
+        if following <= frame or begin < start or begin < arrival(following):
             raise LaeError(
                 f"the policy answered frame {following} at tick {begin} after frame {frame}: "
-                f"it must move forward, and cannot start a frame before its arrival{ask}"
+                "it must move forward, and cannot start a frame before clock.arrival(frame)"
             )
-        yield environment.timeout(begin - start)
+        yield timeout(begin - start)
         frame, start = following, begin
