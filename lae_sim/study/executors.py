@@ -14,7 +14,7 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from lae_sim.decoding import allowing
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, one_line, shown
 
 AHEAD = 3
 """Tasks that are handed out for each worker, so that none waits and few results are held."""
@@ -81,13 +81,8 @@ def _handed_out(
     except LaeError:
         raise
     except Exception as error:  # a worker lost too often, an import, a scheduler that has ended
-        message = " ".join(str(error).split())[:300]
-        what = f"{type(error).__name__}: {message}".removesuffix(": ")
+        what = f"{type(error).__name__}: {one_line(str(error))[:300]}".removesuffix(": ")
         raise LaeError(f"a worker or its scheduler failed, {what}; {_GOES_ON}") from error
-    finally:
-        with suppress(Exception):  # of a cluster that is gone
-            for future in running:
-                future.cancel()
 
 
 @contextmanager
@@ -102,8 +97,7 @@ def _processes(workers: int) -> Iterator[Executor]:
         try:
             yield executor
         except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            for process in list((getattr(executor, "_processes", None) or {}).values()):
+            for process in [*executor._processes.values()]:
                 process.terminate()  # or the end would wait for what they are doing
             raise
 
@@ -139,13 +133,13 @@ def _cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
             client = Client(address, timeout=5, set_as_default=False)
         except (OSError, ValueError) as error:
             raise LaeError(f"no Dask scheduler at {shown(address)}: {error}") from error
+        executor = client.get_executor(pure=False, retries=2)
         try:
-            yield (
-                client.get_executor(pure=False, retries=2),
-                lambda: max(1, sum(client.nthreads().values())),
-            )
+            yield executor, lambda: max(1, sum(client.nthreads().values()))
         finally:
-            with suppress(OSError, RuntimeError):  # its scheduler has ended before
+            with suppress(Exception):  # its scheduler has ended before
+                executor.shutdown(wait=False)  # which cancels what is still to be done
+            with suppress(Exception):
                 client.close()
     finally:
         log.setLevel(level)

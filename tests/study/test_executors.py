@@ -1,8 +1,10 @@
-"""Clusters that end: what is said of them."""
+"""Workers and clusters that end: what becomes of the work, and what is said of it."""
 
 from __future__ import annotations
 
 import sys
+import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from types import ModuleType
@@ -12,6 +14,18 @@ import pytest
 
 from lae_sim.errors import LaeError
 from lae_sim.study.executors import run_all
+
+
+def test_an_end_does_not_wait_for_what_workers_are_doing(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    began = time.monotonic()
+    attempts = run_all(time.sleep, [0, *[600] * 20], 2)
+    assert next(attempts) == (0, None)
+    attempts.close()
+    assert time.monotonic() - began < 100
+    assert capfd.readouterr().err == ""
+    assert not [thread for thread in threading.enumerate() if "Executor" in thread.name]
 
 
 class CommClosedError(OSError):
@@ -44,6 +58,7 @@ def _done(work: Callable[[Any], Any], item: Any) -> Future[Any]:
 class Client:
     """A client of a cluster whose scheduler ends, told what comes of work and of closing it."""
 
+    cancelled = False
     submit: Callable[..., Future[Any]]
     nthreads: Callable[[Client], dict[str, int]]
 
@@ -53,6 +68,11 @@ class Client:
 
     def get_executor(self, **options: Any) -> Client:
         return self
+
+    def shutdown(self, wait: bool) -> None:
+        assert not wait
+        self.__class__.cancelled = True
+        raise CommClosedError("Stream is closed")
 
     def close(self) -> None:
         raise TimeoutError("timed out after 10 s.")
@@ -101,6 +121,7 @@ def test_a_scheduler_that_ends_says_that_the_same_command_goes_on(
 
 def test_what_is_finished_before_counts_though_it_cannot_be_closed(client: type[Client]) -> None:
     assert list(run_all(abs, [-1, -2], 1, "tcp://head:8786")) == [(-1, 1), (-2, 2)]
+    assert client.cancelled
 
 
 @pytest.mark.parametrize("address", ["tcp://no-one:1", "nonsense", "x" * 100_000])
