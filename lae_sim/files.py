@@ -42,7 +42,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         LaeError: if the file cannot be written there.
     """
-    check_place(path)
+    _check_place(path)
     target = Path(os.path.realpath(path))  # write where a link points
     with _explained(target), _temporary(target) as temporary:
         yield temporary
@@ -333,7 +333,7 @@ def check_places(paths: Iterable[str | os.PathLike[str]]) -> None:
             there, or a name is too long.
     """
     for path in paths:
-        check_place(path)
+        _check_place(path)
         folder = Path(os.path.realpath(path)).parent
         if not folder.is_dir():
             raise LaeError(f"cannot write {path}: its folder is not there")
@@ -341,7 +341,7 @@ def check_places(paths: Iterable[str | os.PathLike[str]]) -> None:
             raise LaeError(f"cannot write {path}: its folder cannot be written to")
 
 
-def check_place(path: str | os.PathLike[str]) -> None:
+def _check_place(path: str | os.PathLike[str]) -> None:
     """Refuse to write a file where one cannot be.
 
     Raises:

@@ -174,7 +174,7 @@ def test_places_are_checked_before_the_work(tmp_path: Path) -> None:
 
 def test_what_is_printed_is_not_replaced(tmp_path: Path) -> None:
     """As by ``lae-sim replay ... --events log > log``."""
-    program = "from lae_sim.files import check_place\ncheck_place('log')"
+    program = "from lae_sim.files import check_places\ncheck_places(['log'])"
     with (tmp_path / "log").open("w") as log:
         environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
         run = [sys.executable, "-c", program]

@@ -97,7 +97,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-
     from lae_sim import __version__
     from lae_sim.api.comparison import compare_forecasters
     from lae_sim.report.comparison import comparison_table

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from lae_sim import __version__
-from lae_sim.cli.options import new_parser
+from lae_sim.cli.options import bare_parser
 
 COMMANDS = {
     "compare": "compare forecasters, with intervals and paired tests",
@@ -26,7 +26,7 @@ COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim COMMAND ...``."""
     listing = "\n".join(f"  {name:9}{text}" for name, text in COMMANDS.items())
-    parser = new_parser(
+    parser = bare_parser(
         "lae-sim",
         "Latency-aware evaluation of visual trackers.",
         f"commands:\n{listing}\n\nlae-sim COMMAND --help says more.",

@@ -1,4 +1,4 @@
-"""The options of a replay: policies and latency sources by name."""
+"""What commands share: options, checks of the files they write, and how they end."""
 
 from __future__ import annotations
 
@@ -210,14 +210,19 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2)
 
 
-def new_parser(program: str, description: str, examples: str) -> argparse.ArgumentParser:
-    """A command line's parser, with the option that all have; its help ends with examples."""
-    made = _Parser(
+def bare_parser(program: str, description: str, epilog: str) -> argparse.ArgumentParser:
+    """A parser without options, whose help ends with the epilog as it is."""
+    return _Parser(
         prog=program,
         description=description,
-        epilog=examples,
+        epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def new_parser(program: str, description: str, examples: str) -> argparse.ArgumentParser:
+    """A command's parser, with the option that all have; its help ends with examples."""
+    made = bare_parser(program, description, examples)
     made.add_argument(
         "--max-decoded",
         type=argument(parse_size),

@@ -125,7 +125,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _replay(arguments: argparse.Namespace) -> None:
-
     from lae_sim.api.evaluation import EvaluationResult, plot_evaluations, scenario_bar, scenarios
     from lae_sim.engine.scheduler import scores_latency
     from lae_sim.replay.world import SIGMA_GRID
