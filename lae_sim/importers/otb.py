@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Floats
-from lae_sim.decoding import json_memory, within_budget
-from lae_sim.errors import LaeError, shown
+from lae_sim.decoding import Budget, json_memory, read_bytes
+from lae_sim.errors import LaeError, listed, shown
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,10 @@ def load_json(path: Path) -> Any:
         LaeError: if it is damaged, or larger than any result (see
             :func:`lae_sim.decoding.max_decoded`).
     """
+    data = read_bytes(path, Budget(path))
+    Budget(path).take(json_memory(data))
     try:
-        within_budget(path, path.stat().st_size)
-        data = path.read_bytes()
-        within_budget(path, json_memory(data))
         return json.loads(data, parse_int=float)
-    except OSError as error:
-        raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise LaeError(f"{path}: not readable JSON: {str(error)[:200]}") from error
 
@@ -94,7 +91,7 @@ def _one_pass(content: Any, where: str) -> Mapping[str, Any]:
         runs = [runs]
     for run in runs:
         if not isinstance(run, Mapping) or "res" not in run:
-            fields = f"; there is {', '.join(map(str, run))[:200]}" if isinstance(run, dict) else ""
+            fields = f"; there is {listed(run)}" if isinstance(run, dict) else ""
             raise LaeError(f"{where}: no field 'res' (boxes x, y, w, h){fields}")
     kinds = [run.get("evalType") for run in runs]
     others = sorted({str(kind)[:20] for kind in kinds if kind not in (None, "OPE")})

@@ -21,11 +21,12 @@ from zipfile import ZipFile
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.foreign import HEAD_BYTES, Foreign, foreign, foreign_columns, told_apart
+from lae_sim.datasets.foreign import HEAD_BYTES, Foreign, foreign, foreign_columns, recognised
 from lae_sim.datasets.numbers import read_lines, read_numbers, read_text
 from lae_sim.decoding import Budget, within_budget
 from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
 from lae_sim.errors import LaeError, listed, shown
+from lae_sim.files import check_regular
 from lae_sim.importers.matlab import load_matlab
 from lae_sim.importers.otb import load_json, read_run
 from lae_sim.importers.times import read_times
@@ -173,6 +174,8 @@ def find_results(path: Path, wanted: str = "auto", repetition: int = 1) -> tuple
     """
     if not path.exists():
         raise LaeError(f"{path}: no such file or folder of results")
+    if not path.is_dir():
+        check_regular(path)
     by_format = _by_format(path, repetition)
     if wanted == "auto" and len(by_format) > 1:
         by_format.pop("json", None)  # settings or a summary beside results
@@ -221,7 +224,7 @@ def read_results(
 
 def _read_otb(path: Path) -> Results:
     """Read ``res`` and ``fps``, alone or in ``results`` as the OTB toolkit has them."""
-    with told_apart(path, b"MATLAB", b"\x89HDF"):
+    with recognised(path, b"MATLAB", b"\x89HDF"):
         content = load_json(path) if path.suffix.lower() == ".json" else load_matlab(path)
         run = read_run(content, str(path))
     return Results(_checked_boxes(run.boxes, str(path)), mean_fps=run.mean_fps)
@@ -352,7 +355,7 @@ def _checked_boxes(boxes: Any, where: str) -> Floats:
 
 
 def _npz_names(path: Path) -> list[str]:
-    with told_apart(path, b"PK"):
+    with recognised(path, b"PK"):
         try:
             with ZipFile(path) as archive:
                 entries = archive.infolist()

@@ -98,7 +98,7 @@ def test_without_such_files_nothing_is_said(tmp_path: Path, files: dict[str, str
         ("absence.label", "0\n0\nnan\n0\n0\n0", "line 3: 'nan' is not a number"),
         ("out_of_view.txt", "", "is empty"),
         ("out_of_view.txt", "0,0,0\n0,0\n0", "line 2: 2 columns"),
-        ("out_of_view.txt", "\0", "not a number"),
+        ("out_of_view.txt", "\0", "not a text file"),
     ],
 )
 def test_damaged_flags_are_left_out_and_told(

@@ -1,6 +1,7 @@
 import contextlib
 import io
 import json
+import os
 import struct
 import subprocess
 import sys
@@ -514,3 +515,12 @@ def test_damaged_mean_fps_file(tmp_path, text):
     write(tmp_path / "fps.csv", text)
     with pytest.raises(LaeError, match=r"fps\.csv"):
         given_times(f"mean-fps:{tmp_path / 'fps.csv'}", "any")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no such pipes")
+@pytest.mark.parametrize("suffix", [".txt", ".mat", ".npz", ".json", ".pkl", ""])
+def test_pipes_are_refused_at_once(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    os.mkfifo(path)
+    with pytest.raises(LaeError, match="a pipe, not a file"):
+        find_results(path)
