@@ -237,8 +237,8 @@ def ascending_note(times: Sequence[MeasuredTimes]) -> str | None:
         return None
     return (
         f"times ascend from row to row in {len(names)} of {len(times)} sequences "
-        f"({listed(names, 3)}); if they are since the start, --time-unit {CUMULATIVE}s, -ms, -us or "
-        "-ns says so"
+        f"({listed(names, 3)}); if they are since the start, --time-unit {CUMULATIVE}s, -ms, "
+        "-us or -ns says so"
     )
 
 
