@@ -32,12 +32,12 @@ def run_here(*arguments: object, cwd: Path | None = None) -> subprocess.Complete
     """
     words = [str(argument) for argument in arguments]
     printed, complaint = io.StringIO(), io.StringIO()
-    with _in_folder(cwd or Path.cwd()):
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complaint):
-            try:
-                status = main(words)
-            except SystemExit as end:  # by argparse
-                status = int(end.code or 0)
+    streams = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complaint)
+    with _in_folder(cwd or Path.cwd()), streams[0], streams[1]:
+        try:
+            status = main(words)
+        except SystemExit as end:  # by argparse
+            status = int(end.code or 0)
     return subprocess.CompletedProcess(words, status, printed.getvalue(), complaint.getvalue())
 
 

@@ -347,7 +347,9 @@ def test_a_forecaster_of_ones_own(tmp_path):
     error = replay(SLOW, "--forecaster", "mine:one_argument", cwd=tmp_path, status=2)
     assert "mine:one_argument: TypeError: " in error
     assert "no-such" in replay(SLOW, "--forecaster", "no-such", status=2)
-    assert "ModuleNotFoundError" in replay(SLOW, "--forecaster", "no_such:thing", status=2, run=run_process)
+    assert "ModuleNotFoundError" in replay(
+        SLOW, "--forecaster", "no_such:thing", status=2, run=run_process
+    )
 
 
 @pytest.mark.parametrize(

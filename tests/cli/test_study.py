@@ -385,12 +385,13 @@ def test_a_known_reach_ranks_by_the_model_and_an_assumed_one_does_not(tmp_path: 
 
 def test_the_tables_and_the_page_say_by_what_they_rank(tmp_path: Path) -> None:
     keys = {"latencies": [FAR["latencies"][0]], "search": ["c=0.3", "off"]}
-    printed = study_here(toml(tmp_path, **keys), cwd=tmp_path)
+    alone = ("--workers", 1)
+    printed = study_here(toml(tmp_path, **keys), *alone, cwd=tmp_path)
     assert "ranked by" in printed.splitlines()[1]
     assert "modelled scores, and recorded" in printed.splitlines()[0]
     assert "not computed" not in printed
     assert "the reach is given or measured" in " ".join(printed.split())
-    one = study_here(toml(tmp_path, **{**keys, "search": "c=0.3"}), cwd=tmp_path)
+    one = study_here(toml(tmp_path, **{**keys, "search": "c=0.3"}), *alone, cwd=tmp_path)
     assert one.splitlines()[0].endswith("sigma 0, modelled scores")
     assert "Trackers against each other, by the modelled AUC" in one
     page = (tmp_path / "study-results" / "report.html").read_text()
@@ -406,7 +407,7 @@ def test_the_tables_and_the_page_say_by_what_they_rank(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         ranking["vs hold"].fillna(0), best["vs_hold_modelled_auc"].fillna(0)
     )
-    off = study_here(toml(tmp_path, **{**keys, "search": "off"}), cwd=tmp_path)
+    off = study_here(toml(tmp_path, **{**keys, "search": "off"}), *alone, cwd=tmp_path)
     assert "model" not in off
     assert "ranked" not in off
 
@@ -580,11 +581,11 @@ def test_the_code_of_a_plug_in_is_an_input(
 ) -> None:
     (tmp_path / "code_of_study.py").write_text(OWN)
     path = toml(tmp_path, traces=[str(FAST)], **keys)
+    asked = (path, "--no-report", "--workers", 1)
     for computed in (cells, 0):
-        told = study_command(path, "--no-report", cwd=tmp_path)
-        assert f"{computed} of them computed" in told
+        assert f"{computed} of them computed" in study_command(*asked, cwd=tmp_path)
     (tmp_path / "code_of_study.py").write_text(OWN + "# changed\n")
-    assert f"{changed} of them computed" in study_command(path, "--no-report", cwd=tmp_path)
+    assert f"{changed} of them computed" in study_command(*asked, cwd=tmp_path)
 
 
 def test_what_is_trained_is_not_trained_again(
@@ -694,7 +695,7 @@ def test_what_cannot_be_computed_is_told_and_the_rest_is_done(tmp_path: Path) ->
     path = toml(
         tmp_path, traces=[str(SLOW), str(REAL_TIME)], scales=[1, 2], conventions=conventions
     )
-    told = study_here(path, "--no-report", "--json", cwd=tmp_path, status=1)
+    told = study_here(path, "--no-report", "--json", "--workers", 1, cwd=tmp_path, status=1)
     document = json.loads(told)
     (failure,) = document["failures"]
     assert "synthetic-slow-realtime" in failure["of"]
