@@ -17,11 +17,16 @@ from lae_sim.cli.main import main
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
 
 
+def command(*arguments: object) -> list[str]:
+    """The words of ``lae-sim ARGUMENTS`` as a process, whose warnings are errors."""
+    return [sys.executable, "-W", "error", "-m", "lae_sim", *map(str, arguments)]
+
+
 def run_process(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run ``lae-sim ARGUMENTS`` as a process, whose warnings are errors."""
-    command = [sys.executable, "-W", "error", "-m", "lae_sim", *map(str, arguments)]
+    """Run ``lae-sim ARGUMENTS`` as a process."""
+    words = command(*arguments)
     return subprocess.run(
-        command, capture_output=True, text=True, cwd=cwd, env=ENVIRONMENT, timeout=300
+        words, capture_output=True, text=True, cwd=cwd, env=ENVIRONMENT, timeout=300
     )
 
 

@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from command_line import ENVIRONMENT, run_here, run_process
+from command_line import ENVIRONMENT, command, run_here, run_process
 from places import REPOSITORY
 from restarted import gap_pass
 
@@ -93,10 +92,6 @@ def toml(folder: Path, **keys: Any) -> Path:
     keys = {"traces": [str(SLOW), str(FAST)], "sequences": list(FEW), **keys}
     path.write_text("\n".join(f"{key} = {json.dumps(value)}" for key, value in keys.items()))
     return path
-
-
-def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-W", "error", "-m", "lae_sim", "study", *map(str, arguments)]
 
 
 def study_command(*arguments: object, cwd: Path, status: int = 0) -> str:
@@ -610,7 +605,7 @@ def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
         repetitions=40,
     )  # fmt: skip
     out = tmp_path / "out"
-    asked = command(path, "--out", out, "--workers", 1, "--no-report")
+    asked = command("study", path, "--out", out, "--workers", 1, "--no-report")
     with subprocess.Popen(asked, env=ENVIRONMENT, stdout=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 120
         while len(list(out.glob("results/[!.]*.parquet"))) < 3 and time.monotonic() < deadline:
