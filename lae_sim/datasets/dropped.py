@@ -18,7 +18,7 @@ import numpy as np
 
 from lae_sim._arrays import Ints
 from lae_sim.engine.clock import NS_PER_SECOND, fitting
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed
 
 FRAME_TIMES = ("numbers", "even")
 """When frames with numbers missing arrive: at their own times, or evenly."""
@@ -44,13 +44,13 @@ def step_of(numbers: Sequence[int]) -> int:
     return step if median(steps) <= _MOST_STEPS * step else 0
 
 
-def missing(numbers: Sequence[int], most: int = 4) -> list[int]:
-    """The first numbers that are missing, at most so many; none if all steps are equal."""
+def missing(numbers: Sequence[int]) -> list[int]:
+    """The first numbers that are missing, up to four; none if all steps are equal."""
     step = step_of(numbers)
     if not step:
         return []
     gone = (n for a, b in pairwise(numbers) for n in range(a + step, b, step))
-    return list(islice(gone, most))
+    return list(islice(gone, 4))
 
 
 def arrivals(numbers: Sequence[int], fps: Fraction) -> Ints:
@@ -83,21 +83,19 @@ def check_frame_times(frame_times: str | None) -> str | None:
 def ask(sequence: str, numbers: Sequence[int], fps: Fraction) -> LaeError:
     """The question that frames with numbers missing raise."""
     gone = missing(numbers)
-    before = max(n for n in numbers if n < gone[0])
     some = ", ".join(map(str, gone[:3])) + ", ..." * (len(gone) > 3)
-    are = "is" if len(gone) == 1 else "are"
     return LaeError(
-        f"sequence {sequence!r}: no image number {gone[0]} after {before}: at {fps} frames/s "
-        f"{some} {are} missing. Did the camera drop them? --frame-times numbers (frame_times) "
-        "lets each image come at the time of its number, --frame-times even one after another"
+        f"sequence {sequence!r}: no image number {some}: did the camera drop frames? "
+        "--frame-times numbers (frame_times) lets each image come at the time of its number at "
+        f"{fps} frames/s, --frame-times even one after another"
     )
 
 
 def note(sequences: Iterable[str], frame_times: str) -> str:
     """What to say of sequences with numbers missing, once it is known when their frames come."""
-    names = list(sequences)
-    listed = ", ".join(names[:3]) + f" and {len(names) - 3} more" * (len(names) > 3)
     how = "each image comes at the time of its number"
     if frame_times == "even":
         how = "the images come evenly, as if none were missing"
-    return f"image numbers are missing in {listed}: {how} (--frame-times {frame_times})"
+    return (
+        f"image numbers are missing in {listed(sequences, 3)}: {how} (--frame-times {frame_times})"
+    )

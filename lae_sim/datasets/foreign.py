@@ -13,6 +13,7 @@ import numpy as np
 from lae_sim._arrays import Floats
 from lae_sim.decoding import TooLargeError
 from lae_sim.errors import LaeError
+from lae_sim.files import check_regular
 
 HEAD_BYTES = 1 << 16
 """Of a file, as many are enough for :func:`foreign`."""
@@ -89,25 +90,34 @@ def foreign(head: bytes) -> Foreign | None:
     return None
 
 
+def foreign_file(path: Path, *own: bytes) -> Foreign | None:
+    """The same of a file; None of one that cannot be opened, or begins as its own format does."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError:
+        return None
+    return None if own and head.startswith(own) else foreign(head)
+
+
 @contextmanager
-def told_apart(path: Path, *own: bytes) -> Iterator[None]:
+def recognised(path: Path, *own: bytes) -> Iterator[None]:
     """Say what a file looks like that cannot be read as what it should be.
 
     Args:
         path: the file.
         own: how files of its format begin; such a one is damaged, and not another.
+
+    Raises:
+        LaeError: what the block raised, or, if the file is of another format, what to do with it.
     """
+    check_regular(path)
     try:
         yield
     except TooLargeError:
         raise
     except LaeError as error:
-        try:
-            with path.open("rb") as file:
-                head = file.read(HEAD_BYTES)
-        except OSError:
-            raise error from None
-        other = None if own and head.startswith(own) else foreign(head)
+        other = foreign_file(path, *own)
         if other is None or other.what == _JSON:
             raise
         raise LaeError(f"{path}: {other}") from error

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Floats
-from lae_sim.datasets.absence import read_visible
-from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
+from lae_sim.datasets.absence import read_flags
+from lae_sim.datasets.annotations import find_truth, read_truth
+from lae_sim.datasets.attributes import read_attributes
 from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, image_number, missing, note
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.names import SequenceNames
@@ -122,15 +123,17 @@ def find_dataset(
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
-    found, notes = [], list(attributes.notes)
-    for each in _choose(sequences, truth.files, str(root)):
-        file = truth.files[each]
-        sequence, numbers = _sequence(root, each, file, attributes.of.get(each, ()))
-        visible, left_out = read_visible(file, len(sequence))
-        found.append((replace(sequence, visible=visible), numbers))
-        notes += [f"sequence {each!r}: {left_out}"] if left_out else []
+    files = {each: truth.files[each] for each in _choose(sequences, truth.files, str(root))}
+    found = [
+        _sequence(root, each, file, attributes.of.get(each, ())) for each, file in files.items()
+    ]
+    flags = read_flags(files, {sequence.name: len(sequence) for sequence, _ in found})
+    flagged = [
+        (replace(sequence, visible=flags.visible.get(sequence.name)), numbers)
+        for sequence, numbers in found
+    ]
     fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
-    return _timed(name, fps, found, frame_times, notes)
+    return _timed(name, fps, flagged, frame_times, (*attributes.notes, *flags.notes))
 
 
 def _timed(
@@ -138,13 +141,13 @@ def _timed(
     fps: Fraction,
     sequences: Sequence[tuple[ImageSequence, Sequence[int]]],
     frame_times: str | None,
-    notes: Sequence[str] = (),
+    notes: tuple[str, ...] = (),
 ) -> Dataset:
     """The dataset of sequences with the numbers of their images."""
     made = [sequence for sequence, _ in sequences]
     gaps = [(sequence.name, numbers) for sequence, numbers in sequences if missing(numbers)]
     if not gaps:
-        return Dataset(name, fps, made, notes=tuple(notes))
+        return Dataset(name, fps, made, notes=notes)
     if frame_times is None:
         raise ask(*gaps[0], fps)
     if frame_times == "numbers":  # of all: a trace has the times of every frame, or of none
@@ -261,16 +264,22 @@ def _clip_first(file: Path) -> int:
 def _part(paths: list[Path], first: int | None, length: int, where: str) -> list[Path]:
     """``length`` images from number ``first``, or from the start; none may be missing between."""
     numbers = _numbers(paths)
+    start = 0
     if first is not None:
         if first not in numbers:
             raise LaeError(f"{where}: no image number {first}, where the sequence starts")
         start = numbers.index(first)
-        paths, numbers = paths[start:], numbers[start:]
-    steps = np.diff(numbers[:length])
-    if (steps == 1).any() and (steps != 1).any():
-        gap = numbers[int(np.argmax(steps != 1))]
-        raise LaeError(f"{where}: the image after number {gap} is missing, or there twice")
-    return paths[:length]
+    part = slice(start, start + length)
+    doubtful = [
+        *missing(numbers[part]),
+        *(a for a, b in itertools.pairwise(numbers[part]) if a == b),
+    ]
+    if doubtful:
+        raise LaeError(
+            f"{where}: image number {doubtful[0]} is missing, or there twice, and there are "
+            f"{len(paths)} images for {length} annotations: leave those that are annotated"
+        )
+    return paths[part]
 
 
 def _numbers(paths: Sequence[Path]) -> list[int]:

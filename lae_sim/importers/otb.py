@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -21,21 +20,8 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Floats
-from lae_sim.decoding import json_memory, within_budget
-from lae_sim.errors import LaeError, shown
-
-
-@dataclass(frozen=True)
-class OtbRun:
-    """One pass over a sequence.
-
-    Attributes:
-        boxes: ``x, y, w, h`` in pixels, float64 [n, 4]; NaN = lost.
-        mean_fps: mean frames per second, if it is said.
-    """
-
-    boxes: Floats
-    mean_fps: Fraction | None
+from lae_sim.decoding import Budget, json_memory, read_bytes
+from lae_sim.errors import LaeError, listed, shown
 
 
 def load_json(path: Path) -> Any:
@@ -45,23 +31,24 @@ def load_json(path: Path) -> Any:
         LaeError: if it is damaged, or larger than any result (see
             :func:`lae_sim.decoding.max_decoded`).
     """
+    data = read_bytes(path, Budget(path))
+    Budget(path).take(json_memory(data))
     try:
-        within_budget(path, path.stat().st_size)
-        data = path.read_bytes()
-        within_budget(path, json_memory(data))
         return json.loads(data, parse_int=float)
-    except OSError as error:
-        raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise LaeError(f"{path}: not readable JSON: {str(error)[:200]}") from error
 
 
-def read_run(content: Any, where: str) -> OtbRun:
-    """The run that a file holds.
+def read_run(content: Any, where: str) -> tuple[Floats, Fraction | None]:
+    """The run that a file holds: one pass over a sequence.
 
     Args:
         content: of the file: the run, or runs in a list or under ``results``.
         where: the file, for messages.
+
+    Returns:
+        Boxes ``x, y, w, h`` in pixels, float64 [n, 4], NaN where the target is lost; and mean
+        frames per second, if it says so.
 
     Raises:
         LaeError: if it is no run of one pass over the sequence, or a field is missing or damaged.
@@ -83,8 +70,8 @@ def read_run(content: Any, where: str) -> OtbRun:
     if stated not in (None, len(boxes)):
         raise LaeError(f"{where}: field 'len' is {stated:g}, and 'res' has {len(boxes)} rows")
     if fps is None or not (math.isfinite(fps) and fps > 0):
-        return OtbRun(boxes, None)
-    return OtbRun(boxes, Fraction(fps))
+        return boxes, None
+    return boxes, Fraction(fps)
 
 
 def _one_pass(content: Any, where: str) -> Mapping[str, Any]:
@@ -94,7 +81,7 @@ def _one_pass(content: Any, where: str) -> Mapping[str, Any]:
         runs = [runs]
     for run in runs:
         if not isinstance(run, Mapping) or "res" not in run:
-            fields = f"; there is {', '.join(map(str, run))[:200]}" if isinstance(run, dict) else ""
+            fields = f"; there is {listed(run)}" if isinstance(run, dict) else ""
             raise LaeError(f"{where}: no field 'res' (boxes x, y, w, h){fields}")
     kinds = [run.get("evalType") for run in runs]
     others = sorted({str(kind)[:20] for kind in kinds if kind not in (None, "OPE")})

@@ -18,7 +18,7 @@ import numpy as np
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.numbers import NUMBER, read_cells
 from lae_sim.engine.clock import MAX_INT64, UNIT_NS
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, hint, listed, shown
 
 CUMULATIVE = "cumulative-"
 UNITS = ("s", "ms", "us", "ns", "fps", *(f"{CUMULATIVE}{unit}" for unit in ("s", "ms", "us", "ns")))
@@ -235,10 +235,10 @@ def ascending_note(times: Sequence[MeasuredTimes]) -> str | None:
     ]
     if not names:
         return None
-    which = ", ".join(map(repr, names[:3])) + (", ..." if len(names) > 3 else "")
     return (
-        f"times ascend from row to row in {len(names)} of {len(times)} sequences ({which}); if "
-        f"they are since the start, --time-unit {CUMULATIVE}s, -ms, -us or -ns says so"
+        f"times ascend from row to row in {len(names)} of {len(times)} sequences "
+        f"({listed(names, 3)}); if they are since the start, --time-unit {CUMULATIVE}s, -ms, "
+        "-us or -ns says so"
     )
 
 

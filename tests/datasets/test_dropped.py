@@ -80,9 +80,7 @@ def test_times_beyond_64_bits() -> None:
 def test_a_gap_is_a_question(tmp_path: Path) -> None:
     sequence(tmp_path, [1, 2, 3], "a")
     sequence(tmp_path, DROPPED)
-    question = (
-        r"sequence 'ball': no image number 6 after 5: at 30 frames/s 6, 8, 10, \.\.\. are missing"
-    )
+    question = r"sequence 'ball': no image number 6, 8, 10, \.\.\.: did the camera drop"
     with pytest.raises(LaeError, match=question) as error:
         find_dataset(root=tmp_path)
     assert "--frame-times numbers" in str(error.value)
@@ -135,7 +133,7 @@ def test_datasets_without_gaps_are_as_they_were(
 def test_images_with_a_first_box_alone(tmp_path: Path) -> None:
     sequence(tmp_path, DROPPED)
     folder = tmp_path / "ball" / "img"
-    with pytest.raises(LaeError, match="sequence 'img': no image number 6 after 5"):
+    with pytest.raises(LaeError, match="sequence 'img': no image number 6, 8, 10"):
         find_dataset(root=folder, box=[1, 2, 3, 4])
     (found,) = find_dataset(root=folder, box=[1, 2, 3, 4], frame_times="numbers").sequences
     assert found.arrival_ns is not None

@@ -268,7 +268,7 @@ def test_fewer_images_than_annotations(walk):
 def test_a_missing_image_in_the_middle(walk):
     images(walk / "img", "%04d.jpg", range(7, 9))
     (walk / "img" / "0003.jpg").unlink()
-    with pytest.raises(LaeError, match="'walk': the image after number 2 is missing"):
+    with pytest.raises(LaeError, match="'walk': image number 3 is missing"):
         find_dataset(root=walk)
 
 
@@ -321,5 +321,5 @@ def test_flags_of_absence_and_what_is_wrong_with_them(tmp_path):
     assert flags[0].tolist() == [True, True, False, True]
     assert flags[1:] == [None, None]
     [note] = dataset.notes
-    assert note.startswith("sequence 'boat-2': flags of absence are left out: ")
+    assert note.startswith("flags of absence of 1 of 3 sequences are left out, such as ")
     assert note.endswith("out_of_view.txt: 3 flags, and there are 4 frames")
