@@ -9,7 +9,7 @@ demo: $(VENV)/.demo  ## replay the sample traces
 	$(BIN)/lae-sim replay traces/synthetic-slow.parquet traces/synthetic-fast.parquet
 
 test: $(VENV)/.test  ## run the tests
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: $(VENV)/.dev  ## format, lint, types and the order of imports
 	$(BIN)/ruff format --check .

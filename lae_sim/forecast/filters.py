@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -89,9 +90,15 @@ class IMM:
         """The filter of one sequence."""
         from filterpy.kalman import IMMEstimator, KalmanFilter
 
+        class Model(KalmanFilter):  # type: ignore[misc]
+            @property
+            def likelihood(self) -> float:
+                """At least the smallest normal number: half of a smaller one may be 0."""
+                return max(float(super().likelihood), sys.float_info.min)
+
         models = []
         for _ in range(2):
-            model = KalmanFilter(dim_x=2 * _COORDINATES, dim_z=_COORDINATES)
+            model = Model(dim_x=2 * _COORDINATES, dim_z=_COORDINATES)
             model.x = np.array([*box, *[0.0] * _COORDINATES], np.float64)
             model.H = np.eye(_COORDINATES, 2 * _COORDINATES)
             model.R *= self.r

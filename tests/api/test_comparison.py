@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from command_line import run_here
 from matplotlib.figure import Figure
 from nasty import NASTY, nasty_traces
 from places import REPOSITORY, TRACES
@@ -64,15 +62,8 @@ def test_the_command_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = {"latency": ["constant:20ms", "constant:47ms"], "scale": [1.5], "seed": 3}
     result = lae_sim.compare_forecasters(path, forecasters="kalman", **settings)
     options = "--latency constant:20ms constant:47ms --latency-scale 1.5 --seed 3 --attributes"
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "lae_sim", "compare", path, "--forecaster", "kalman"]
-        + [*options.split(), "--json"],
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
+    done = run_here("compare", path, "--forecaster", "kalman", *options.split(), "--json")
+    assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     for key, table in (("summary", result.summary), ("attributes", result.attributes)):
         rows = json.loads(table.to_json(orient="records", double_precision=15))

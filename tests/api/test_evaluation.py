@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
-import subprocess
 import sys
 import types
 from collections.abc import Sequence
@@ -17,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from command_line import run_here
 from matplotlib.figure import Figure
 from nasty import NASTY, nasty_traces
 from places import REPOSITORY, TRACES
@@ -135,16 +134,9 @@ def test_answers_of_several_traces_are_told_apart_by_name() -> None:
 # ----------------------------------------------------------------------------- the command line
 
 
-def command(*arguments: object, cwd: Path | None = None) -> dict[str, Any]:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "lae_sim", "replay", *map(str, arguments), "--json"],
-        cwd=cwd or REPOSITORY,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
+def command(*arguments: object) -> dict[str, Any]:
+    done = run_here("replay", *arguments, "--json", cwd=REPOSITORY)
+    assert done.returncode == 0, done.stderr
     document: dict[str, Any] = json.loads(done.stdout)
     return document
 
@@ -154,8 +146,15 @@ SAME: list[tuple[Sequence[str], dict[str, Any], Sequence[str]]] = [
     ([SLOW_HERE], {}, []),
     (
         [SLOW_HERE, FAST_HERE],
-        {"forecasters": ["hold", "imm", "kalman:q=3,decay=0.99"], "sigma": [0, 0.1, "1/3"]},
-        ["--forecaster", "hold", "imm", "kalman:q=3,decay=0.99", "--sigma", "0", "0.1", "1/3"],
+        {
+            "forecasters": ["hold", "imm", "kalman:q=3,decay=0.99"],
+            "sigma": [0, 0.1, "1/3"],
+            "sequences": "boat-calm",  # since imm takes its time
+        },
+        [
+            *("--forecaster", "hold", "imm", "kalman:q=3,decay=0.99"),
+            *("--sigma", "0", "0.1", "1/3", "--sequence", "boat-calm"),
+        ],
     ),
     (
         [SLOW_HERE],

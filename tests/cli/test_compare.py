@@ -5,12 +5,8 @@ Much of it runs in this process, since importing pandas and scipy takes longer t
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
-import os
 import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,49 +14,32 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from command_line import ENVIRONMENT, command, run_here, run_process
 from places import REPOSITORY
 from restarted import gap_pass
 
 import lae_sim
-from lae_sim.cli.compare import main
 
 SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
 FAST = REPOSITORY / "traces" / "synthetic-fast.parquet"
 REAL_TIME = REPOSITORY / "traces" / "synthetic-slow-realtime.parquet"
 FEW = ["--sequence", "bike-pan", "car-chase", "person-crowd"]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-
-
-def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-W", "error", "-m", "lae_sim", "compare", *map(str, arguments)]
 
 
 def compare(*arguments: object, cwd: Path | None = None, status: int = 0) -> str:
     """Run the command and return what it printed; its error text if it fails as expected."""
-    done = subprocess.run(
-        command(*arguments),
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        env=ENVIRONMENT,
-        timeout=120,
-    )
-    assert done.returncode == status, done.stderr
-    assert "" in (done.stdout, done.stderr)  # no progress bar where nobody looks
-    return done.stderr if status else done.stdout
+    return checked(run_process("compare", *arguments, cwd=cwd), status)
 
 
 def compare_here(*arguments: object, status: int = 0) -> str:
     """The same in this process."""
-    printed, complaint = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complaint):
-        try:
-            found = main([str(argument) for argument in arguments])
-        except SystemExit as stopped:  # by argparse
-            found = stopped.code
-    assert found == status, complaint.getvalue()
-    assert "" in (printed.getvalue(), complaint.getvalue())
-    return complaint.getvalue() if status else printed.getvalue()
+    return checked(run_here("compare", *arguments), status)
+
+
+def checked(done: subprocess.CompletedProcess[str], status: int) -> str:
+    assert done.returncode == status, done.stderr
+    assert "" in (done.stdout, done.stderr)  # no progress bar where nobody looks
+    return done.stderr if status else done.stdout
 
 
 MUCH = [
@@ -128,7 +107,7 @@ def test_the_json_object(everything: tuple[dict[str, Any], Path]) -> None:
 def test_what_initialisation_costs_is_said_of_each_replay() -> None:
     latencies = ("constant:20ms,init=1s", "constant:20ms")
     options = (SLOW, *FEW, "--forecaster", "kalman", "--latency", *latencies)
-    document = json.loads(compare(*options, "--json"))
+    document = json.loads(compare_here(*options, "--json"))
     said = [(each["latency"], each["mean_ms"], each["source"]) for each in document["init"]]
     assert said == [
         ("constant:20ms,init=1s", 1000, "assumed: 1000 ms"),
@@ -136,7 +115,7 @@ def test_what_initialisation_costs_is_said_of_each_replay() -> None:
     ]
     assert document["init"][0]["left_search"]
     assert document["init"][1]["left_search"] == []
-    text = compare(*options)
+    text = compare_here(*options)
     assert "constant:20ms,init=1s: initialisation costs 1,000 ms: an assumption" in text
     assert "constant:20ms: initialisation costs 20 ms, the same as a frame: an assumption" in text
 
@@ -220,7 +199,7 @@ def test_the_search_model_beside_and_off(tmp_path: Path) -> None:
 
 
 def test_it_stops_quietly_when_nobody_reads() -> None:
-    arguments = command(SLOW, *FEW, "--forecaster", "hold", "--json")
+    arguments = command("compare", SLOW, *FEW, "--forecaster", "hold", "--json")
     with subprocess.Popen(
         arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=ENVIRONMENT
     ) as process:

@@ -12,6 +12,7 @@ from typing import IO
 import cv2
 import numpy as np
 import pytest
+from command_line import ENVIRONMENT, run_here
 from places import REPOSITORY
 
 from lae_sim.cli.main import main
@@ -19,16 +20,15 @@ from lae_sim.importers.convert import convert_results
 from lae_sim.trace.file import read_trace, write_trace
 
 SLOW, FAST = (REPOSITORY / "traces" / f"synthetic-{name}.parquet" for name in ("slow", "fast"))
-PROFILE = ("profile", "--in-process", "--sequence", "race", "--out", "out.parquet")
+PROFILE = ("profile", "--in-process", "--root", "ds", "--out", "out.parquet")
 CONVERT = ("convert", "kcf", "--truth", "ds", "--out", "out.parquet", "--time")
 
 
-def run(
-    *arguments: str, cwd: Path, stdout: int | IO[bytes] = subprocess.PIPE, stderr: int = -1
+def run_into(
+    stdout: IO[bytes], *arguments: str, cwd: Path, stderr: int = subprocess.PIPE
 ) -> subprocess.CompletedProcess[bytes]:
     command = [sys.executable, "-m", "lae_sim", *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    return subprocess.run(command, cwd=cwd, stdout=stdout, stderr=stderr, env=environment)
+    return subprocess.run(command, cwd=cwd, stdout=stdout, stderr=stderr, env=ENVIRONMENT)
 
 
 @pytest.fixture
@@ -103,8 +103,8 @@ REPLACING = [
 @pytest.mark.parametrize("command", REPLACING)
 def test_no_input_and_no_other_trace_is_replaced(command: str, world: Path) -> None:
     before = contents(world)
-    done = run(*command.split(), cwd=world)
-    error = done.stderr.decode()
+    done = run_here(*command.split(), cwd=world)
+    error = done.stderr
     assert done.returncode == 2, error
     assert any(words in error for words in ("would replace", "is a trace", "--force")), error
     assert "Traceback" not in error
@@ -118,9 +118,9 @@ def test_a_film_of_a_sequence_does_not_replace_the_video(world: Path) -> None:
         writer.write(np.zeros((60, 80, 3), np.uint8))
     writer.release()
     before = (world / "car.mp4").read_bytes()
-    done = run("render", "kcf.parquet", "--root", "car.mp4", "--out", ".", cwd=world)
+    done = run_here("render", "kcf.parquet", "--root", "car.mp4", "--out", ".", cwd=world)
     assert done.returncode == 2
-    assert b"car.mp4 would replace a file that is read" in done.stderr
+    assert "car.mp4 would replace a file that is read" in done.stderr
     assert (world / "car.mp4").read_bytes() == before
 
 
@@ -130,16 +130,16 @@ def test_a_trace_of_another_tracker_or_dataset_is_replaced_by_force_only(
 ) -> None:
     out = world / "out.parquet"
     out.touch()  # an empty file holds nothing that could be lost
-    assert run(*command, cwd=world).returncode == 0
+    assert run_here(*command, cwd=world).returncode == 0
     made = read_trace(out).metadata
-    assert run(*command, cwd=world).returncode == 0  # its own may be made anew
+    assert run_here(*command, cwd=world).returncode == 0  # its own may be made anew
     for other in (SLOW, world / "own.py"):
         shutil.copy(other, out)
-        done = run(*command, cwd=world)
+        done = run_here(*command, cwd=world)
         assert done.returncode == 2
-        assert b"--force" in done.stderr
+        assert "--force" in done.stderr
         assert out.read_bytes() == other.read_bytes()
-        assert run(*command, "--force", cwd=world).returncode == 0
+        assert run_here(*command, "--force", cwd=world).returncode == 0
         assert read_trace(out).metadata.tracker == made.tracker
 
 
@@ -149,11 +149,11 @@ def test_what_replay_and_compare_write_is_replaced(world: Path) -> None:
     show = "show . --plot p.svg"  # a folder of traces is not all read
     for _ in range(2):
         for command in (replay, compare):
-            done = run(*command.split(), cwd=world)
+            done = run_here(*command.split(), cwd=world)
             assert done.returncode == 0, done.stderr
     for name in ("s.parquet", "o.parquet"):
         (world / name).unlink()  # which are no traces
-    assert run(*show.split(), cwd=world).returncode == 0
+    assert run_here(*show.split(), cwd=world).returncode == 0
 
 
 @pytest.fixture
@@ -164,17 +164,17 @@ def unread() -> IO[bytes]:
     return os.fdopen(writing, "wb")
 
 
-def test_a_profile_that_nobody_watches_leaves_its_trace(tmp_path: Path, unread: IO[bytes]) -> None:
-    shutil.copy(SLOW, tmp_path / "out.parquet")
+def test_a_profile_that_nobody_watches_leaves_its_trace(world: Path, unread: IO[bytes]) -> None:
+    shutil.copy(SLOW, world / "out.parquet")
     with unread:  # both streams, as 2>&1 | head; the first line would say what is replaced
-        done = run(*PROFILE, "--force", cwd=tmp_path, stdout=unread, stderr=subprocess.STDOUT)
+        done = run_into(unread, *PROFILE, "--force", cwd=world, stderr=subprocess.STDOUT)
     assert done.returncode == 0
-    assert read_trace(tmp_path / "out.parquet").names == ("race",)
+    assert read_trace(world / "out.parquet").names == ("car",)
 
 
 def test_a_failure_that_nobody_reads_is_one(tmp_path: Path, unread: IO[bytes]) -> None:
     with unread:
-        done = run("replay", "no.parquet", cwd=tmp_path, stdout=unread, stderr=subprocess.STDOUT)
+        done = run_into(unread, "replay", "no.parquet", cwd=tmp_path, stderr=subprocess.STDOUT)
     assert done.returncode == 2
 
 
@@ -188,7 +188,7 @@ def test_a_broken_standard_output_after_the_work_is_silent(
 ) -> None:
     shutil.copy(SLOW, tmp_path / "slow.parquet")
     with unread:
-        done = run(*command.split(), cwd=tmp_path, stdout=unread)
+        done = run_into(unread, *command.split(), cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, b"")
     assert (tmp_path / "p.svg").stat().st_size > 0
 
@@ -208,7 +208,7 @@ def test_another_pipe_that_breaks_is_an_error(tmp_path: Path) -> None:
     """
     done = subprocess.run(
         [sys.executable, "-c", program],
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        env=ENVIRONMENT,
         capture_output=True,
         cwd=tmp_path,
         check=False,
@@ -219,15 +219,15 @@ def test_another_pipe_that_breaks_is_an_error(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no sh")
 @pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
-def test_closed_streams_change_no_status(closed: str, tmp_path: Path) -> None:
-    profile = "profile --sequence race --out out.parquet"  # whose worker takes over descriptors
+def test_closed_streams_change_no_status(closed: str, world: Path) -> None:
+    profile = "profile --root ds --out out.parquet"  # whose worker takes over descriptors
     for command, status in ((f"replay {SLOW} --json", 0), ("replay no.parquet", 2), (profile, 0)):
         shell = f"exec {sys.executable} -m lae_sim {command} {closed}"
         done = subprocess.run(
             ["sh", "-c", shell],
-            env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+            env=ENVIRONMENT,
             capture_output=True,
-            cwd=tmp_path,
+            cwd=world,
             check=False,
         )
         assert done.returncode == status, done.stderr

@@ -1,4 +1,7 @@
-"""The replay command line as a user runs it: subprocesses, files, exit statuses."""
+"""The replay command line as a user runs it: what it prints and writes, exit statuses.
+
+Much of it runs in this process, since starting another takes longer than the work.
+"""
 
 import json
 import os
@@ -10,6 +13,7 @@ from fractions import Fraction
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from command_line import run_here, run_process
 from places import REPOSITORY
 
 import lae_sim
@@ -31,13 +35,9 @@ REAL_TIME = REPOSITORY / "traces" / "synthetic-slow-realtime.parquet"
 CONFORMANCE = sorted((REPOSITORY.parent / "shared" / "conformance").glob("*.json"))
 
 
-def replay(*arguments, cwd=None, status=0):
+def replay(*arguments, cwd=None, status=0, run=run_here):
     """Run the command and return what it printed; its error text if it fails as expected."""
-    command = [sys.executable, "-W", "error", "-m", "lae_sim", "replay", *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    done = subprocess.run(
-        command, capture_output=True, text=True, cwd=cwd, env=environment, timeout=120
-    )
+    done = run("replay", *arguments, cwd=cwd)
     assert done.returncode == status, done.stderr
     if status:
         assert "Traceback" not in done.stderr
@@ -347,7 +347,9 @@ def test_a_forecaster_of_ones_own(tmp_path):
     error = replay(SLOW, "--forecaster", "mine:one_argument", cwd=tmp_path, status=2)
     assert "mine:one_argument: TypeError: " in error
     assert "no-such" in replay(SLOW, "--forecaster", "no-such", status=2)
-    assert "ModuleNotFoundError" in replay(SLOW, "--forecaster", "no_such:thing", status=2)
+    assert "ModuleNotFoundError" in replay(
+        SLOW, "--forecaster", "no_such:thing", status=2, run=run_process
+    )
 
 
 @pytest.mark.parametrize(
@@ -555,9 +557,7 @@ def test_attributes_that_the_trace_does_not_name(tmp_path):
 
 
 def test_both_doors_lead_to_the_same_room():
-    command = [sys.executable, "-m", "lae_sim", "replay", str(FAST)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY, timeout=60)
-    assert done.stdout == replay(FAST, cwd=REPOSITORY)
+    assert replay(FAST, run=run_process) == replay(FAST)
     listing = subprocess.run(
         [sys.executable, "-m", "lae_sim", "--help"], capture_output=True, text=True, cwd=REPOSITORY
     ).stdout

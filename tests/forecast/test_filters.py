@@ -120,6 +120,14 @@ def test_constant_velocity_is_followed(factory: Any) -> None:
     np.testing.assert_allclose(model.predict(250), [750, -250, 20, 20], atol=0.5)
 
 
+def test_imm_answers_after_a_jump_of_hardly_any_likelihood() -> None:
+    """Of 5e-324, the smallest number above 0, half is 0: then no model would be likely at all."""
+    for distance in np.arange(530, 600, 0.25):
+        model = IMM(1, 1)([0, 0, 20, 20], None)
+        model.update(1, [distance, 0, 20, 20])
+        assert np.isfinite(model.predict(2)).all()
+
+
 @pytest.mark.parametrize("factory", FACTORIES, ids=str)
 def test_a_target_that_jumps_far_is_answered(factory: Any) -> None:
     boxes = [[0, 0, 20, 20], [1e5, 0, 20, 20], [0, -1e5, 900, 1], [5, 5, 20, 20]]

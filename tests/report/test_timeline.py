@@ -1,7 +1,4 @@
 import json
-import os
-import subprocess
-import sys
 from collections import defaultdict
 from fractions import Fraction
 from itertools import pairwise
@@ -9,6 +6,7 @@ from itertools import pairwise
 import jsonschema
 import numpy as np
 import pytest
+from command_line import run_here
 from hypothesis import given
 from hypothesis import strategies as st
 from places import REPOSITORY
@@ -177,9 +175,7 @@ def test_the_tracks_are_the_schedule_and_the_event_log(times, fps, sigma, policy
 
 
 def replay(*arguments, status=0, cwd=None):
-    command = [sys.executable, "-W", "error", "-m", "lae_sim", "replay", *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=cwd)
+    done = run_here("replay", *arguments, cwd=cwd)
     assert done.returncode == status, done.stderr
     return done.stderr if status else done.stdout
 

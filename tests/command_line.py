@@ -1,0 +1,61 @@
+"""A command line as a user runs it: in a process of its own, or in this one, which is faster."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from places import REPOSITORY
+
+from lae_sim.cli.main import main
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+
+
+def command(*arguments: object) -> list[str]:
+    """The words of ``lae-sim ARGUMENTS`` as a process, whose warnings are errors."""
+    return [sys.executable, "-W", "error", "-m", "lae_sim", *map(str, arguments)]
+
+
+def run_process(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run ``lae-sim ARGUMENTS`` as a process."""
+    words = command(*arguments)
+    return subprocess.run(
+        words, capture_output=True, text=True, cwd=cwd, env=ENVIRONMENT, timeout=300
+    )
+
+
+def run_here(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the same in this process, which has imported everything already.
+
+    What is imported from ``cwd`` is forgotten, so that another folder may have its like.
+    """
+    words = [str(argument) for argument in arguments]
+    printed, complaint = io.StringIO(), io.StringIO()
+    streams = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complaint)
+    with _in_folder(cwd or Path.cwd()), streams[0], streams[1]:
+        try:
+            status = main(words)
+        except SystemExit as end:  # by argparse
+            status = int(end.code or 0)
+    return subprocess.CompletedProcess(words, status, printed.getvalue(), complaint.getvalue())
+
+
+@contextlib.contextmanager
+def _in_folder(folder: Path) -> Iterator[None]:
+    before, path, modules = Path.cwd(), list(sys.path), set(sys.modules)
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+        sys.path[:] = path
+        for name in set(sys.modules) - modules:
+            file = getattr(sys.modules[name], "__file__", None) or ""
+            if Path(file).parent == folder:
+                del sys.modules[name]
