@@ -56,7 +56,13 @@ _CONTAINERS = (
     ".txt",
     ".html",
     ".mat",
+    ".npy",
+    ".npz",
+    ".pkl",
+    ".xlsx",
+    ".ods",
 )
+_TABLES = (".csv", ".tsv", ".dat")
 _MOST_LOOKED_AT = 2000
 
 # The first ten are named so by the toolkit's experiments/perfPlot.m, and the paper (Li and Yeung,
@@ -114,7 +120,7 @@ _VISDRONE = (
     "Scale Variation",
     "Viewpoint Change",
 )
-_ATTRIBUTES_BY_SUFFIX = {"_att": (_UAVDT,), "_attr": (_VISDRONE,), "": (_UAV123, _DTB70)}
+_ATTRIBUTES_BY_SUFFIX = {"_att": (_UAVDT,), "_attr": (_VISDRONE,), "": (_UAV123, _DTB70, _DTB70[:10])}
 
 
 @dataclass(frozen=True)
@@ -387,7 +393,10 @@ def _is_same(file: Path, other: Path) -> bool:
 def _instead(root: Path) -> str | None:
     """What lies in a folder without ground truth that is known here, in words."""
     paths = itertools.chain(root.glob("*"), root.glob("*/*"), root.glob("*/gt/gt.txt"))
+    table = None
     for path in itertools.islice(paths, _MOST_LOOKED_AT):
+        if path.suffix.lower() in _TABLES and path.name != "attributes.csv" and path.is_file():
+            table = table or path
         if path.suffix.lower() not in _CONTAINERS or not path.is_file():
             continue
         try:
@@ -399,6 +408,8 @@ def _instead(root: Path) -> str | None:
             continue
         if other is not None:
             return f"{path} {other}"
+    if table is not None:
+        return f"is {table} a table? Name it <seq>.txt, a line x,y,w,h for each frame"
     return None
 
 

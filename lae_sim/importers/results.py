@@ -152,8 +152,10 @@ def frame_ns(fps: Fraction) -> int:
     """The time of one frame at a mean rate, ns, rounded half to even.
 
     Raises:
-        LaeError: if a frame takes too long.
+        LaeError: if a frame takes too long, or less than a nanosecond.
     """
+    if fps > 10**9:
+        raise LaeError(f"a mean of {float(min(fps, 10**300)):g} fps: a frame takes 1 ns at least")
     return fitting(round(10**9 / fps), f"a mean of {float(fps):g} fps")
 
 

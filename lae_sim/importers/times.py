@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.numbers import NUMBER, read_cells
+from lae_sim.datasets.numbers import NUMBER, read_cells, read_lines
 from lae_sim.engine.clock import MAX_INT64, UNIT_NS
 from lae_sim.errors import LaeError, hint, shown
 
@@ -86,7 +86,7 @@ def read_times(path: Path, unit: str | None = None, column: int = 0) -> tuple[In
             of each frame ascend like times since the start.
     """
     parse_unit(unit)
-    rows = read_cells(path)
+    rows = read_cells(path, lines=_header_as_one_cell(read_lines(path)))
     if column >= len(rows[0]):
         raise LaeError(f"{path}: has {len(rows[0])} columns of times, not {column + 1}")
     cells = [row[column] for row in rows]
@@ -101,9 +101,22 @@ def read_times(path: Path, unit: str | None = None, column: int = 0) -> tuple[In
         values.append(Fraction(cell))
         if values[-1] > MAX_INT64:  # in whatever unit
             raise LaeError(f"{path}, line {number}: {cell[:40]} is too long a time")
+    if len(values) > 2 and values == list(range(int(values[0]), int(values[0]) + len(values))):
+        raise LaeError(
+            f"{path}: its column {column + 1} counts the frames, {values[0]} to {values[-1]}: keep "
+            "the column of times only"
+        )
     if unit is None and looks_cumulative(np.array(values, np.float64)):
         raise LaeError(f"{path}: {_question_of_sums(values)}")
     return _elapsed(values, unit or "s", path, first_line), unit
+
+
+def _header_as_one_cell(lines: Sequence[str]) -> list[str]:
+    """The lines, with a first one such as ``# Time (ms)`` as the name of the only column."""
+    first = lines[0].lstrip("# ")
+    if len(lines) > 1 and first[:1].isalpha() and NUMBER.match(lines[1]):
+        return ["_".join(first.split()), *lines[1:]]
+    return list(lines)
 
 
 def _is_header(cell: str) -> bool:
