@@ -9,9 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 from lae_sim.errors import LaeError, shown
+from lae_sim.files import check_regular
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -98,6 +100,23 @@ class Budget:
                 f"{self._path}: would take more than {most:,.4g} MiB of memory, too much for such "
                 f"a file; if it is right, --max-decoded {math.ceil(4 * most)}MiB allows more"
             )
+
+
+def read_bytes(path: Path, budget: Budget) -> bytes:
+    """The content of a file, taken from its budget before it is read.
+
+    Raises:
+        LaeError: if it is not there, no file, or cannot be read.
+        TooLargeError: if it is too much.
+    """
+    check_regular(path)
+    try:
+        budget.take(path.stat().st_size)
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise LaeError(f"{path}: no such file") from error
+    except OSError as error:
+        raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def within_budget(path: str | os.PathLike[str], size: int) -> None:

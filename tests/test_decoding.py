@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from lae_sim.decoding import Budget, TooLargeError, allowing, max_decoded, parse_size
+from lae_sim.decoding import (
+    Budget,
+    TooLargeError,
+    allowing,
+    max_decoded,
+    parse_size,
+    read_bytes,
+)
 from lae_sim.errors import LaeError
 
 
@@ -39,3 +48,16 @@ def test_a_budget_is_that_of_the_block() -> None:
         assert left(None) == 1 << 20
     assert left(None) == 256 << 20
     assert elsewhere(None) == 1 << 20  # as in another process
+
+
+def test_a_file_is_read_within_its_budget(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"12345678")
+    with max_decoded(8):
+        assert read_bytes(path, Budget(path)) == b"12345678"
+    with max_decoded(7), pytest.raises(TooLargeError, match=r"a\.bin: would take more than"):
+        read_bytes(path, Budget(path))
+    with pytest.raises(LaeError, match="none: no such file"):
+        read_bytes(tmp_path / "none", Budget(path))
+    with pytest.raises(LaeError, match="a folder, not a file"):
+        read_bytes(tmp_path, Budget(path))

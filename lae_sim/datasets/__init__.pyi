@@ -1,4 +1,5 @@
-from .annotations import GroundTruth, find_truth, read_attributes, read_truth
+from .annotations import GroundTruth, find_truth, read_truth
+from .attributes import read_attributes
 from .frames import Dataset, Image, ImageSequence
 from .layouts import find_dataset
 from .synthetic import synthetic_dataset

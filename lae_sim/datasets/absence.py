@@ -10,12 +10,14 @@ VOT's long-term and depth challenges (``full-occlusion.tag``, ``out-of-frame.tag
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lae_sim._arrays import Bools
-from lae_sim.datasets.annotations import read_lost
+from lae_sim.datasets.attributes import left_out
+from lae_sim.datasets.nfs import read_lost
 from lae_sim.datasets.numbers import read_numbers
 from lae_sim.errors import LaeError
 
@@ -41,6 +43,20 @@ _OF_FLAT_FILES: Mapping[str, _Rule] = {
 }
 
 
+@dataclass(frozen=True)
+class Flags:
+    """A dataset's flags of absence, as far as they could be read.
+
+    Attributes:
+        visible: of the sequences that have any: False where the target is absent or fully covered,
+            bool [T].
+        notes: which were left out, and why.
+    """
+
+    visible: Mapping[str, Bools]
+    notes: tuple[str, ...] = ()
+
+
 def absence_files(truth: Path) -> dict[Path, _Rule]:
     """The files with flags of absence that go with a file of ground truth."""
     folder = truth.parent
@@ -51,26 +67,34 @@ def absence_files(truth: Path) -> dict[Path, _Rule]:
     return {path: rule for path, rule in files.items() if path.is_file()}
 
 
-def read_visible(truth: Path, frames: int) -> tuple[Bools | None, str | None]:
-    """Where the target is visible, as far as the dataset says so.
+def read_flags(truth: Mapping[str, Path], frames: Mapping[str, int]) -> Flags:
+    """Where targets are visible, as far as the dataset says so.
 
-    Such files are an extra: what is wrong with one is told, and none of the sequence's flags count.
+    Such files are an extra: where one is damaged, none of the sequence's flags count, and a note
+    says so.
 
     Args:
-        truth: the file of ground truth.
-        frames: how many frames the sequence has.
-
-    Returns:
-        False where the target is absent or fully covered, bool [frames], or None where nothing
-        (valid) is said; and what is wrong, if anything is.
+        truth: the file of ground truth of each sequence.
+        frames: how many frames each has.
     """
-    try:
-        absent = [_absent(path, rule, frames) for path, rule in absence_files(truth).items()]
-        lost = read_lost(truth, frames)
-    except LaeError as error:
-        return None, f"flags of absence are left out: {error}"
+    visible: dict[str, Bools] = {}
+    errors = []
+    for name, file in truth.items():
+        try:
+            flags = _read(file, frames[name])
+        except LaeError as error:
+            errors.append(error)
+            continue
+        if flags is not None:
+            visible[name] = flags
+    return Flags(visible, left_out("flags of absence", errors, len(truth)))
+
+
+def _read(truth: Path, frames: int) -> Bools | None:
+    absent = [_absent(path, rule, frames) for path, rule in absence_files(truth).items()]
+    lost = read_lost(truth, frames)
     absent += [] if lost is None else [lost]
-    return (~np.logical_or.reduce(absent) if absent else None), None
+    return ~np.logical_or.reduce(absent) if absent else None
 
 
 def _absent(path: Path, rule: _Rule, frames: int) -> Bools:

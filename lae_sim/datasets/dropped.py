@@ -18,7 +18,7 @@ import numpy as np
 
 from lae_sim._arrays import Ints
 from lae_sim.engine.clock import NS_PER_SECOND, fitting
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed
 
 FRAME_TIMES = ("numbers", "even")
 """When frames with numbers missing arrive: at their own times, or evenly."""
@@ -27,9 +27,17 @@ _DIGITS = re.compile("[0-9]+")
 _MOST_STEPS = 10  # a typical step beyond which numbers count something else, such as milliseconds
 
 
-def image_number(stem: str) -> int:
-    """The number of an image, the last one in its name without the ending; -1 without any."""
-    return int("".join(_DIGITS.findall(stem)[-1:]) or -1)
+def numbers_in(stems: Sequence[str]) -> list[int]:
+    """The number of each image, from the names without their endings; -1 without any.
+
+    It is the last number in the name that is not the same in all of them: in ``cam2_0007_640x480``
+    it is 7.
+    """
+    found = [_DIGITS.findall(stem) for stem in stems]
+    if len({len(each) for each in found}) == 1:
+        changing = [at for at, column in enumerate(zip(*found)) if len(set(column)) > 1]
+        found = [[each[at] for at in changing] or each for each in found]
+    return [int("".join(each[-1:]) or -1) for each in found]
 
 
 def step_of(numbers: Sequence[int]) -> int:
@@ -83,21 +91,19 @@ def check_frame_times(frame_times: str | None) -> str | None:
 def ask(sequence: str, numbers: Sequence[int], fps: Fraction) -> LaeError:
     """The question that frames with numbers missing raise."""
     gone = missing(numbers)
-    before = max(n for n in numbers if n < gone[0])
     some = ", ".join(map(str, gone[:3])) + ", ..." * (len(gone) > 3)
-    are = "is" if len(gone) == 1 else "are"
     return LaeError(
-        f"sequence {sequence!r}: no image number {gone[0]} after {before}: at {fps} frames/s "
-        f"{some} {are} missing. Did the camera drop them? --frame-times numbers (frame_times) "
-        "lets each image come at the time of its number, --frame-times even one after another"
+        f"sequence {sequence!r}: no image number {some}: did the camera drop frames? "
+        "--frame-times numbers (frame_times) lets each image come at the time of its number at "
+        f"{fps} frames/s, --frame-times even one after another"
     )
 
 
 def note(sequences: Iterable[str], frame_times: str) -> str:
     """What to say of sequences with numbers missing, once it is known when their frames come."""
-    names = list(sequences)
-    listed = ", ".join(names[:3]) + f" and {len(names) - 3} more" * (len(names) > 3)
     how = "each image comes at the time of its number"
     if frame_times == "even":
         how = "the images come evenly, as if none were missing"
-    return f"image numbers are missing in {listed}: {how} (--frame-times {frame_times})"
+    return (
+        f"image numbers are missing in {listed(sequences, 3)}: {how} (--frame-times {frame_times})"
+    )

@@ -13,6 +13,7 @@ import numpy as np
 from lae_sim._arrays import Floats
 from lae_sim.decoding import TooLargeError
 from lae_sim.errors import LaeError
+from lae_sim.files import check_regular
 
 HEAD_BYTES = 1 << 16
 """Of a file, as many are enough for :func:`foreign`."""
@@ -93,13 +94,17 @@ def foreign(head: bytes) -> Foreign | None:
 
 
 @contextmanager
-def told_apart(path: Path, *own: bytes) -> Iterator[None]:
+def recognised(path: Path, *own: bytes) -> Iterator[None]:
     """Say what a file looks like that cannot be read as what it should be.
 
     Args:
         path: the file.
         own: how files of its format begin; such a one is damaged, and not another.
+
+    Raises:
+        LaeError: what the block raised, or, if the file is of another format, what to do with it.
     """
+    check_regular(path)
     try:
         yield
     except TooLargeError:

@@ -19,9 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Floats
-from lae_sim.datasets.absence import read_visible
-from lae_sim.datasets.annotations import find_truth, read_attributes, read_truth
-from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, image_number, missing, note
+from lae_sim.datasets.absence import read_flags
+from lae_sim.datasets.annotations import find_truth, read_truth
+from lae_sim.datasets.attributes import read_attributes
+from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing, note, numbers_in
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.names import SequenceNames
 from lae_sim.datasets.synthetic import synthetic_dataset
@@ -122,15 +123,17 @@ def find_dataset(
         first = next(iter(truth.files))
         name = "GOT-10k" if first.startswith("GOT-10k_") else truth.dataset
     attributes = read_attributes(truth)
-    found, notes = [], list(attributes.notes)
-    for each in _choose(sequences, truth.files, str(root)):
-        file = truth.files[each]
-        sequence, numbers = _sequence(root, each, file, attributes.of.get(each, ()))
-        visible, left_out = read_visible(file, len(sequence))
-        found.append((replace(sequence, visible=visible), numbers))
-        notes += [f"sequence {each!r}: {left_out}"] if left_out else []
+    files = {each: truth.files[each] for each in _choose(sequences, truth.files, str(root))}
+    found = [
+        _sequence(root, each, file, attributes.of.get(each, ())) for each, file in files.items()
+    ]
+    flags = read_flags(files, {sequence.name: len(sequence) for sequence, _ in found})
+    flagged = [
+        (replace(sequence, visible=flags.visible.get(sequence.name)), numbers)
+        for sequence, numbers in found
+    ]
     fps = fps or truth.fps or Fraction(_FPS.get(name, 30))
-    return _timed(name, fps, found, frame_times, notes)
+    return _timed(name, fps, flagged, frame_times, (*attributes.notes, *flags.notes))
 
 
 def _timed(
@@ -138,13 +141,13 @@ def _timed(
     fps: Fraction,
     sequences: Sequence[tuple[ImageSequence, Sequence[int]]],
     frame_times: str | None,
-    notes: Sequence[str] = (),
+    notes: tuple[str, ...] = (),
 ) -> Dataset:
     """The dataset of sequences with the numbers of their images."""
     made = [sequence for sequence, _ in sequences]
     gaps = [(sequence.name, numbers) for sequence, numbers in sequences if missing(numbers)]
     if not gaps:
-        return Dataset(name, fps, made, notes=tuple(notes))
+        return Dataset(name, fps, made, notes=notes)
     if frame_times is None:
         raise ask(*gaps[0], fps)
     if frame_times == "numbers":  # of all: a trace has the times of every frame, or of none
@@ -274,7 +277,7 @@ def _part(paths: list[Path], first: int | None, length: int, where: str) -> list
 
 
 def _numbers(paths: Sequence[Path]) -> list[int]:
-    return [image_number(path.stem) for path in paths]
+    return numbers_in([path.stem for path in paths])
 
 
 def _list_images(folder: Path) -> list[Path]:

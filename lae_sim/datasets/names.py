@@ -19,10 +19,11 @@ _DATASET = re.compile(
     re.IGNORECASE,
 )
 _PART = re.compile(r"(?:\d+|s)\Z")  # of a video, as in car1_s; no tracker is called so
+_PART_OF_VIDEO = re.compile(r"[-_.](\d{1,2}|s)\Z")
 
 
 @dataclass(frozen=True)
-class Reading:
+class ResultsName:
     """What the name of a results file says.
 
     Attributes:
@@ -47,7 +48,7 @@ class SequenceNames:
         for name in sorted(self._names):
             self._alike.setdefault(_folded(name), []).append(name)
 
-    def read(self, written: str, tracker: str | None = None) -> Reading | None:
+    def read(self, written: str, tracker: str | None = None) -> ResultsName | None:
         """What a name means, or None if it fits no sequence.
 
         A sequence that fits as it stands comes before one that fits with other capitals or
@@ -71,7 +72,7 @@ class SequenceNames:
                     f"truth is its own with --truth-file {part}=FILE"
                 )
             if sequences:
-                return Reading(sequences[0], rest)
+                return ResultsName(sequences[0], rest)
         return None
 
     def meant(self, written: str) -> list[str]:
@@ -100,3 +101,12 @@ def _splits(written: str) -> list[tuple[str, str]]:
 
 def _folded(name: str) -> str:
     return re.sub(r"[-._ ]+", "_", name).casefold()
+
+
+def video_of(sequence: str) -> str:
+    """The video that a sequence is part of, by its name.
+
+    A number or an ``s`` at the end tells parts apart: ``car1_1``, ``car1_2`` and ``car1_s`` are one
+    video, and so are ``Jogging-1`` and ``Jogging-2``.
+    """
+    return _PART_OF_VIDEO.sub("", sequence)

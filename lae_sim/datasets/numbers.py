@@ -15,9 +15,8 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.datasets.foreign import HEAD_BYTES, foreign
-from lae_sim.decoding import Budget
+from lae_sim.decoding import Budget, read_bytes
 from lae_sim.errors import LaeError
-from lae_sim.files import check_regular
 
 # A cell as a str, and its place in a list.
 _CELL_BYTES = 64
@@ -148,21 +147,15 @@ def read_text(path: Path, budget: Budget) -> str:
     Raises:
         LaeError: if it cannot be read, is no such text, or takes too much.
     """
-    check_regular(path)
+    data = read_bytes(path, budget)
+    budget.take(len(data) + _CELL_BYTES * data.count(b"\n"))  # as text, and its lines
+    other = foreign(data[:HEAD_BYTES])
+    if other is not None:
+        raise LaeError(f"{path}: {other}")
+    utf_16 = data.startswith(_UTF_16)  # as Windows' shell writes it
+    if not utf_16 and b"\0" in data[:4]:
+        raise LaeError(f"{path}: not a text file in UTF-8 but in UTF-16: save it as UTF-8")
     try:
-        budget.take(path.stat().st_size)
-        data = path.read_bytes()
-        budget.take(len(data) + _CELL_BYTES * data.count(b"\n"))  # as text, and its lines
-        other = foreign(data[:HEAD_BYTES])
-        if other is not None:
-            raise LaeError(f"{path}: {other}")
-        utf_16 = data.startswith(_UTF_16)  # as Windows' shell writes it
-        if not utf_16 and b"\0" in data[:4]:
-            raise LaeError(f"{path}: not a text file in UTF-8 but in UTF-16: save it as UTF-8")
         return data.decode("utf-16" if utf_16 else "utf-8-sig")
-    except FileNotFoundError as error:
-        raise LaeError(f"{path}: no such file") from error
-    except OSError as error:
-        raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise LaeError(f"{path}: not a text file") from error

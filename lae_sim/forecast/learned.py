@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Floats
-from lae_sim.datasets.annotations import video_of
+from lae_sim.datasets.names import video_of
 from lae_sim.errors import LaeError
 from lae_sim.files import written_whole
 from lae_sim.forecast.window import Window, Windowed

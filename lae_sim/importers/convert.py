@@ -12,25 +12,18 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.absence import absence_files, read_visible
-from lae_sim.datasets.annotations import GroundTruth, find_truth, read_attributes, read_truth
+from lae_sim.datasets.absence import absence_files, read_flags
+from lae_sim.datasets.annotations import GroundTruth, find_truth, read_truth
+from lae_sim.datasets.attributes import read_attributes
 from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing
 from lae_sim.datasets.layouts import image_numbers
-from lae_sim.datasets.names import Reading, SequenceNames
 from lae_sim.engine.clock import Clock, Number, parse_fps
-from lae_sim.errors import LaeError, hint, listed, shown
+from lae_sim.errors import LaeError, listed, shown
 from lae_sim.importers.coordinates import other_reading, row_0_is_off
+from lae_sim.importers.given import NO_TIMES, GivenTimes, frame_ns, given_times
 from lae_sim.importers.lae_pvt import read_run
-from lae_sim.importers.results import (
-    NO_TIMES,
-    GivenTimes,
-    Results,
-    Source,
-    find_results,
-    frame_ns,
-    given_times,
-    read_results,
-)
+from lae_sim.importers.matching import match_results
+from lae_sim.importers.results import Results, Source, find_results, read_results
 from lae_sim.importers.times import (
     MeasuredTimes,
     ascending_note,
@@ -132,7 +125,7 @@ def convert_results(
         format: a name of :data:`lae_sim.importers.results.FORMATS`, or ``"auto"``.
         fps: world frames per second, such as ``30`` or ``"30000/1001"``; by default 30, or 10 if
             the dataset's name says ``10fps``. Of NfS it chooses the set, of 30 or 240.
-        time: where times come from (see :func:`lae_sim.importers.results.given_times`).
+        time: where times come from (see :func:`lae_sim.importers.given.given_times`).
         time_unit: of measured times: ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, or ``"fps"`` for rates;
             ``"cumulative-s"`` and so on for times since the start. By default seconds, if no header
             says otherwise and their median is from 0.5 to 250 ms.
@@ -184,7 +177,7 @@ def convert_results(
     other = {name: Path(path) for name, path in (truth_files or {}).items()}
     asked = None if fps is None else parse_fps(fps)
     annotations = find_truth(Path(truth), asked).with_files(other)
-    found = _with_truth(results, sources, annotations, tracker, skip_missing)
+    found = match_results(results, sources, annotations, tracker, skip_missing)
     known = found.sources
     absent = sorted({*sequences, *exclude, *other} - set(known))
     if absent:
@@ -216,7 +209,15 @@ def convert_results(
     as_published = converted.recordings
     recordings = [_started(recording, matched[recording.name].path) for recording in as_published]
     attributes = read_attributes(annotations)
+    row_0_from_truth = [
+        new.name for new, old in zip(recordings, as_published) if new.boxes is not old.boxes
+    ]
     recordings, notes = _flagged(recordings, annotations)
+    if found.unnamed:
+        notes.append(
+            f"results whose names tell no tracker are left out beside those of {found.tracker}: "
+            f"{listed(found.unnamed)}"
+        )
     incomplete: list[str] = []
     if kind != "lae-pvt":  # whose recorded loop took the frames evenly, whatever their numbers
         recordings, incomplete = _arrived(recordings, annotations, clock.fps, frame_times)
@@ -232,7 +233,9 @@ def convert_results(
         device={"model": device} if device else {},
         dataset={"name": dataset, **({"frame_times": frame_times} if frame_times else {})},
         timing=converted.timing,
-        sequences=_sequence_entries(matched, attributes.of, image_size),
+        sequences=_sequence_entries(
+            matched, attributes.of, image_size, converted.held, row_0_from_truth
+        ),
     )
     left_out = {*matched, *exclude}
     elapsed = np.concatenate([recording.elapsed_ns for recording in recordings])
@@ -251,9 +254,7 @@ def convert_results(
         held=converted.held,
         frame_times=frame_times,
         numbers_missing=incomplete,
-        row_0_from_truth=[
-            new.name for new, old in zip(recordings, as_published) if new.boxes is not old.boxes
-        ],
+        row_0_from_truth=row_0_from_truth,
         other_trackers=found.others,
         without_truth=found.without_truth,
         without_results=[n for n in annotations.files if not sequences and n not in left_out],
@@ -266,100 +267,6 @@ def convert_results(
         ],
     )
     return Trace(metadata, recordings), summary
-
-
-@dataclass(frozen=True)
-class _Matched:
-    """Results and the sequences of the ground truth that they are of.
-
-    Attributes:
-        sources: by sequence.
-        tracker: whose they are, if their names say it.
-        without_truth: names of the tracker's results of no known sequence.
-        others: the other trackers whose results lie there.
-    """
-
-    sources: Mapping[str, Source]
-    tracker: str | None
-    without_truth: list[str]
-    others: list[str]
-
-
-def _with_truth(
-    path: Path, sources: Sequence[Source], truth: GroundTruth, tracker: str | None, skip: bool
-) -> _Matched:
-    """Match results of one tracker, the one that is asked for where there are several."""
-    by_tracker, missing = _by_tracker(sources, truth, tracker)
-    plain = by_tracker.pop("", {})
-    if plain and tracker not in by_tracker:  # what follows a sequence's name is part of it
-        chosen, others, matched = None, list[str](), plain
-        missing += [source.name for found in by_tracker.values() for source in found.values()]
-    else:
-        chosen, others = _one_tracker(path, sorted(by_tracker), tracker)
-        matched = by_tracker.get(chosen or "", {})
-        if others or plain:
-            missing = [name for name in missing if chosen in (name.split("_", 1)[0], *_tails(name))]
-    if not matched or (missing and not skip):
-        raise LaeError(
-            f"{truth.root}: no ground truth for {listed(sorted(missing))}, of {len(sources)} "
-            "results"
-            + ("; --skip-missing leaves them out" if matched else "; is it the right dataset?")
-        )
-    return _Matched(matched, chosen, sorted(missing), others)
-
-
-def _by_tracker(
-    sources: Sequence[Source], truth: GroundTruth, tracker: str | None
-) -> tuple[dict[str, dict[str, Source]], list[str]]:
-    """The results of each tracker by sequence, and the names of those of no known sequence.
-
-    Results whose names tell no tracker are those of tracker "".
-    """
-    names = SequenceNames(truth.files)
-    only_truth = next(iter(truth.files)) if truth.root.is_file() and len(sources) == 1 else None
-    by_tracker: dict[str, dict[str, Source]] = {}
-    missing = []
-    for source in sources:
-        try:
-            reading = names.read(source.name, tracker)
-        except LaeError as error:
-            raise LaeError(f"{source.path}: {error}") from error
-        if reading is None and only_truth:
-            reading = Reading(only_truth)
-        if reading is None:
-            missing.append(source.name)
-            continue
-        results = by_tracker.setdefault(reading.tracker or "", {})
-        other = results.setdefault(reading.sequence, source)
-        if other is not source:
-            raise LaeError(
-                f"{source.path} and {other.path} are both results of sequence "
-                f"{reading.sequence!r}; give the folder or file of one tracker"
-            )
-    return by_tracker, missing
-
-
-def _tails(name: str) -> list[str]:
-    """What stands behind each underscore."""
-    return [name[at + 1 :] for at, character in enumerate(name) if character == "_"]
-
-
-def _one_tracker(
-    path: Path, found: Sequence[str], wanted: str | None
-) -> tuple[str | None, list[str]]:
-    """The tracker whose results are taken, and the others that lie there.
-
-    Raises:
-        LaeError: if there are several, and none of them is the one that is wanted.
-    """
-    if len(found) < 2:
-        return next(iter(found), None), []
-    if wanted in found:
-        return wanted, [tracker for tracker in found if tracker != wanted]
-    raise LaeError(
-        f"{path}: holds results of {len(found)} trackers ({listed(found, 20)}); "
-        + (f"none is {wanted!r}{hint(wanted, found)}" if wanted else "choose one with --tracker")
-    )
 
 
 @dataclass(frozen=True)
@@ -531,23 +438,20 @@ def _started(recording: Recording, results: Path) -> Recording:
 
 
 def _flagged(
-    recordings: Iterable[Recording], truth: GroundTruth
+    recordings: Sequence[Recording], truth: GroundTruth
 ) -> tuple[list[Recording], list[str]]:
     """The recordings with the dataset's flags of absence, and what is to be said of these."""
-    flagged, notes = [], []
-    for recording in recordings:
-        visible, note = read_visible(truth.files[recording.name], len(recording))
-        flagged.append(replace(recording, visible=visible))
-        notes += [f"sequence {recording.name!r}: {note}"] if note else []
-    absent = [int((~each.visible).sum()) for each in flagged if each.visible is not None]
+    files = {recording.name: truth.files[recording.name] for recording in recordings}
+    flags = read_flags(files, {recording.name: len(recording) for recording in recordings})
+    absent = [np.count_nonzero(~visible) for visible in flags.visible.values()]
+    notes = [*flags.notes]
     if any(absent):
-        notes.insert(
-            0,
+        notes.append(
             f"the target is said to be absent in {sum(absent):,} frames, in "
-            f"{np.count_nonzero(absent)} of {len(flagged)} sequences; --convention lasot leaves "
-            "them out",
+            f"{np.count_nonzero(absent)} of {len(files)} sequences; --convention lasot leaves "
+            "them out"
         )
-    return flagged, notes
+    return [replace(each, visible=flags.visible.get(each.name)) for each in recordings], notes
 
 
 def _arrived(
@@ -578,15 +482,20 @@ def _sequence_entries(
     names: Iterable[str],
     attributes: Mapping[str, tuple[str, ...]],
     size: tuple[int, int] | None,
-) -> dict[str, dict[str, list[Any]]]:
+    held: Mapping[str, int],
+    row_0_from_truth: Collection[str],
+) -> dict[str, dict[str, Any]]:
     """What the trace says of each sequence."""
-    entries: dict[str, dict[str, list[Any]]] = {}
+    entries: dict[str, dict[str, Any]] = {}
     for name in names:
-        entry: dict[str, list[Any]] = {
+        entry = {
             "attributes": list(attributes.get(name, ())),
             "image_size": list(size or ()),
+            "row_0_from_truth": name in row_0_from_truth,
         }
         entries[name] = {key: value for key, value in entry.items() if value}
+        if held:  # a tracker that never says so may have lost its target all the same
+            entries[name]["lost"] = held.get(name, 0)
     return entries
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from lae_sim._arrays import Floats
 from lae_sim.decoding import within_budget
 from lae_sim.engine.clock import NS_PER_SECOND, Clock
-from lae_sim.errors import LaeError, shown
+from lae_sim.errors import LaeError, listed, shown
 from lae_sim.importers.pickles import load_plain
 from lae_sim.replay.run import replay_sequence
 from lae_sim.trace.recording import Recording
@@ -153,9 +153,7 @@ def _column(path: Path, content: Mapping[Any, Any], key: str) -> list[tuple[int,
     if isinstance(column, np.ndarray) and column.ndim:
         column = column.tolist()
     if not isinstance(column, (list, tuple)):
-        present = ", ".join(
-            sorted(str(key) if isinstance(key, str) else shown(key) for key in content)[:8]
-        )
+        present = listed(key if isinstance(key, str) else shown(key) for key in content)
         raise LaeError(f"{path}: no list {key!r} (it has {present or 'nothing'})")
     return list(enumerate(column))
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim.decoding import Budget
+from lae_sim.decoding import Budget, read_bytes
 from lae_sim.errors import LaeError
 from lae_sim.importers.hdf5 import load_hdf5
 
@@ -59,11 +59,7 @@ def load_matlab(path: Path) -> dict[str, Any]:
             (:func:`lae_sim.decoding.max_decoded`), or of version 7.3 and h5py is not installed.
     """
     budget = Budget(path)
-    try:
-        budget.take(path.stat().st_size)
-        data = memoryview(path.read_bytes())
-    except OSError as error:
-        raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
+    data = memoryview(read_bytes(path, budget))
     head = bytes(data[:_HEADER_BYTES])
     if head.startswith((b"MATLAB 7.3", b"\x89HDF")):
         return load_hdf5(path)

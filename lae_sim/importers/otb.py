@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Floats
-from lae_sim.decoding import json_memory, within_budget
-from lae_sim.errors import LaeError, shown
+from lae_sim.decoding import Budget, json_memory, read_bytes
+from lae_sim.errors import LaeError, listed, shown
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,10 @@ def load_json(path: Path) -> Any:
         LaeError: if it is damaged, or larger than any result (see
             :func:`lae_sim.decoding.max_decoded`).
     """
+    data = read_bytes(path, Budget(path))
+    Budget(path).take(json_memory(data))
     try:
-        within_budget(path, path.stat().st_size)
-        data = path.read_bytes()
-        within_budget(path, json_memory(data))
         return json.loads(data, parse_int=float)
-    except OSError as error:
-        raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise LaeError(f"{path}: not readable JSON: {str(error)[:200]}") from error
 
@@ -90,11 +87,15 @@ def read_run(content: Any, where: str) -> OtbRun:
 def _one_pass(content: Any, where: str) -> Mapping[str, Any]:
     """The run of one pass over the whole sequence (OPE)."""
     runs = content.get("results", content) if isinstance(content, Mapping) else content
+    if isinstance(content, Mapping) and "res" not in content:
+        tables = [value for value in content.values() if _is_boxes(value)]
+        if len(tables) == 1:  # under another name, such as bbox
+            runs = {**content, "res": tables[0]}
     if not isinstance(runs, list):
         runs = [runs]
     for run in runs:
         if not isinstance(run, Mapping) or "res" not in run:
-            fields = f"; there is {', '.join(map(str, run))[:200]}" if isinstance(run, dict) else ""
+            fields = f"; there is {listed(run)}" if isinstance(run, dict) else ""
             raise LaeError(f"{where}: no field 'res' (boxes x, y, w, h){fields}")
     kinds = [run.get("evalType") for run in runs]
     others = sorted({str(kind)[:20] for kind in kinds if kind not in (None, "OPE")})
@@ -105,6 +106,10 @@ def _one_pass(content: Any, where: str) -> Mapping[str, Any]:
         )
     first: Mapping[str, Any] = runs[0]
     return first
+
+
+def _is_boxes(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] == 4 < value.size
 
 
 def _table(value: Any) -> Floats:

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim.datasets.foreign import told_apart
-from lae_sim.decoding import Budget, TooLargeError
+from lae_sim.datasets.foreign import recognised
+from lae_sim.decoding import Budget, TooLargeError, read_bytes
 from lae_sim.errors import LaeError
 
 _MAX_DEPTH = 32
@@ -94,10 +94,9 @@ def load_plain(path: Path) -> Any:
         LaeError: if the file asks for anything else, which it names, or is damaged.
     """
     budget = Budget(path)
-    with told_apart(path, b"\x80"):
+    with recognised(path, b"\x80"):
+        data = read_bytes(path, budget)
         try:
-            budget.take(path.stat().st_size)
-            data = path.read_bytes()
             _check_operations(data, budget)
             # Python 2 keeps bytes and text alike; latin1 keeps every byte.
             return _Decoder().decode(_Unpickler(io.BytesIO(data), encoding="latin1").load())
@@ -108,8 +107,6 @@ def load_plain(path: Path) -> Any:
                 f"{path}: {error}: a pickle of results may hold numbers, text, lists, dicts and "
                 "numeric NumPy arrays only"
             ) from error
-        except FileNotFoundError as error:
-            raise LaeError(f"{path}: no such file") from error
         except Exception as error:  # a hostile pickle can raise anything
             raise LaeError(
                 f"{path}: not a readable pickle: {ascii(str(error))[1:-1][:200]}"

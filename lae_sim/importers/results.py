@@ -6,11 +6,8 @@ Each reader gives the boxes and, where the files have them, the times. Real-time
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
-from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
@@ -21,18 +18,16 @@ from zipfile import ZipFile
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.foreign import HEAD_BYTES, Foreign, foreign, foreign_columns, told_apart
-from lae_sim.datasets.numbers import read_lines, read_numbers, read_text
-from lae_sim.decoding import Budget, within_budget
-from lae_sim.engine.clock import fitting, parse_duration, parse_fps, split_init
-from lae_sim.errors import LaeError, listed, shown
+from lae_sim.datasets.foreign import HEAD_BYTES, Foreign, foreign, foreign_columns, recognised
+from lae_sim.datasets.numbers import read_lines, read_numbers
+from lae_sim.decoding import within_budget
+from lae_sim.errors import LaeError
+from lae_sim.files import check_regular
 from lae_sim.importers.matlab import load_matlab
 from lae_sim.importers.otb import load_json, read_run
 from lae_sim.importers.times import read_times
 
 FORMATS = ("got10k", "pytracking", "ope", "mat", "json", "npz", "lae-pvt")
-
-NO_TIMES = "give --time constant:47ms, --time mean-fps:120 or --time mean-fps:FILE.csv"
 
 _SUFFIXES = {
     ".json": "json",
@@ -80,85 +75,6 @@ class Results:
     unit: str | None = None
 
 
-@dataclass(frozen=True)
-class GivenTimes:
-    """Processing times that were not measured per frame.
-
-    Attributes:
-        source: what the trace says of them.
-        constant_ns: one time for all, or None.
-        per_sequence: frames (if stated) and time in ns of each sequence.
-        init_ns: the time of the initialisation, if it is not that of a frame.
-        file: where they were read, if from a file.
-    """
-
-    source: str
-    constant_ns: int | None
-    per_sequence: Mapping[str, tuple[int | None, int]]
-    init_ns: int | None = None
-    file: Path | None = None
-
-    def of(self, sequence: str, frames: int) -> int:
-        """The time of every frame of a sequence of ``frames`` frames, ns.
-
-        Raises:
-            LaeError: if it is not there, or is that of another number of frames.
-        """
-        if self.constant_ns is not None:
-            return self.constant_ns
-        if sequence not in self.per_sequence:
-            raise LaeError(f"{self.source}: no row for sequence {sequence!r}")
-        stated, elapsed_ns = self.per_sequence[sequence]
-        if stated not in (None, frames):
-            raise LaeError(
-                f"{self.source}: sequence {sequence!r} has {stated} frames there and {frames} here"
-            )
-        return elapsed_ns
-
-
-def given_times(text: str, tracker: str) -> GivenTimes | None:
-    """Times by the names that command lines use; None means the measured ones.
-
-    Args:
-        text: ``measured``, ``constant:47ms``, ``mean-fps:120`` or ``mean-fps:FILE.csv`` (columns
-            sequence, fps and perhaps tracker, frames); all but the first may end in
-            ``,init=800ms``, what the initialisation takes.
-        tracker: whose rows to take where the file has several trackers.
-
-    Raises:
-        LaeError: if there is no such name, or the file lacks the tracker or a column.
-    """
-    if text == "measured":
-        return None
-    name = text.partition(":")[0] if isinstance(text, str) else None
-    if name not in ("constant", "mean-fps"):
-        raise LaeError(f"time: no {text!r:.40}: use the measured ones, or {NO_TIMES}")
-    times, init_ns = split_init(text, path=name == "mean-fps")
-    _, _, value = times.partition(":")
-    init = "" if init_ns is None else f", initialisation {init_ns / 1e6:g} ms"
-    if name == "constant":
-        amount = re.sub(r"(?<=\d)(?=[a-z])", " ", value)
-        source = f"constant {amount}{init}, not measured"
-        return GivenTimes(source, parse_duration(value), {}, init_ns)
-    if not value.lower().endswith(".csv"):
-        source = f"mean fps {value} given{init}, not measured per frame"
-        return GivenTimes(source, frame_ns(parse_fps(value)), {}, init_ns)
-    source = f"mean fps of each sequence from {Path(value).name}{init}, not measured per frame"
-    rows = dict(_mean_fps_rows(Path(value), tracker))
-    return GivenTimes(source, None, rows, init_ns, Path(value))
-
-
-def frame_ns(fps: Fraction) -> int:
-    """The time of one frame at a mean rate, ns, rounded half to even.
-
-    Raises:
-        LaeError: if a frame takes too long, or less than a nanosecond.
-    """
-    if fps > 10**9:
-        raise LaeError(f"a mean of {float(min(fps, 10**300)):g} fps: a frame takes 1 ns at least")
-    return fitting(round(10**9 / fps), f"a mean of {float(fps):g} fps")
-
-
 def find_results(path: Path, wanted: str = "auto", repetition: int = 1) -> tuple[str, list[Source]]:
     """Find the results files of one tracker.
 
@@ -175,6 +91,8 @@ def find_results(path: Path, wanted: str = "auto", repetition: int = 1) -> tuple
     """
     if not path.exists():
         raise LaeError(f"{path}: no such file or folder of results")
+    if not path.is_dir():
+        check_regular(path)
     by_format = _by_format(path, repetition)
     if wanted == "auto" and len(by_format) > 1:
         by_format.pop("json", None)  # settings or a summary beside results
@@ -223,7 +141,7 @@ def read_results(
 
 def _read_otb(path: Path) -> Results:
     """Read ``res`` and ``fps``, alone or in ``results`` as the OTB toolkit has them."""
-    with told_apart(path, b"MATLAB", b"\x89HDF"):
+    with recognised(path, b"MATLAB", b"\x89HDF"):
         content = load_json(path) if path.suffix.lower() == ".json" else load_matlab(path)
         run = read_run(content, str(path))
     return Results(_checked_boxes(run.boxes, str(path)), mean_fps=run.mean_fps)
@@ -254,30 +172,6 @@ def _text_boxes(path: Path) -> Floats:
     if other is not None:
         raise LaeError(f"{path}: {other}")
     return _checked_boxes(table, str(path))
-
-
-def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | None, int]]]:
-    """Sequence, frames (if stated) and time in ns of each row of a table of mean fps."""
-    try:
-        rows = list(csv.DictReader(io.StringIO(read_text(path, Budget(path)), newline="")))
-    except csv.Error as error:
-        raise LaeError(f"{path}: cannot be read: {error}") from error
-    if not rows or not {"sequence", "fps"} <= set(rows[0]):
-        raise LaeError(f"{path}: needs a header with the columns sequence and fps")
-    trackers = sorted({row["tracker"] or "" for row in rows if "tracker" in row})
-    if trackers and tracker not in trackers:
-        raise LaeError(
-            f"{path}: has {listed(trackers)}, not {shown(tracker)}; if it is there under another "
-            "name, give that with --tracker"
-        )
-    for number, row in enumerate(rows, 2):
-        if row.get("tracker", tracker) != tracker:
-            continue
-        try:
-            frames = int(row["frames"]) if row.get("frames") else None
-            yield row["sequence"], (frames, frame_ns(parse_fps(row["fps"] or "")))
-        except (LaeError, ValueError) as error:
-            raise LaeError(f"{path}, line {number}: {error}") from error
 
 
 def _by_format(path: Path, repetition: int) -> dict[str, list[Source]]:
@@ -338,7 +232,7 @@ def _text_format(sources: list[Source]) -> str:
 def _checked_boxes(boxes: Any, where: str) -> Floats:
     if not (isinstance(boxes, np.ndarray) and boxes.dtype.kind in "iuf" and boxes.ndim == 2):
         raise LaeError(f"{where}: boxes must be a table of numbers")
-    if boxes.shape[1] != 4:
+    if boxes.shape[1] != 4 and not np.isnan(boxes).all():
         raise LaeError(f"{where}: {boxes.shape[1]} columns; boxes have 4: x, y, w, h")
     table = boxes.astype(np.float64, copy=False)
     lost = np.isnan(table).all(axis=1)
@@ -349,12 +243,12 @@ def _checked_boxes(boxes: Any, where: str) -> Floats:
             "write NaN in all four columns"
         )
     if lost.all():
-        raise LaeError(f"{where}: holds no box at all")
+        raise LaeError(f"{where}: holds no box at all; --exclude leaves its sequence out")
     return table
 
 
 def _npz_names(path: Path) -> list[str]:
-    with told_apart(path, b"PK"):
+    with recognised(path, b"PK"):
         try:
             with ZipFile(path) as archive:
                 entries = archive.infolist()

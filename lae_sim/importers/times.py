@@ -18,7 +18,7 @@ import numpy as np
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.numbers import NUMBER, read_cells, read_lines
 from lae_sim.engine.clock import MAX_INT64, UNIT_NS
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, hint, listed, shown
 
 CUMULATIVE = "cumulative-"
 UNITS = ("s", "ms", "us", "ns", "fps", *(f"{CUMULATIVE}{unit}" for unit in ("s", "ms", "us", "ns")))
@@ -182,7 +182,13 @@ def check_seconds(times: Sequence[MeasuredTimes]) -> None:
     Raises:
         LaeError: if they cannot; it asks for the unit.
     """
-    unsaid = [each for each in times if each.unit is None and each.elapsed_ns.any()]
+    unsaid = [each for each in times if each.unit is None]
+    if unsaid and not any(each.elapsed_ns.any() for each in unsaid):
+        raise LaeError(
+            f"{unsaid[0].path}: all times are 0, as if none had been measured: give --time "
+            "constant:47ms, or --time-unit s if they are right"
+        )
+    unsaid = [each for each in unsaid if each.elapsed_ns.any()]
     if not unsaid:
         return
     low, high = (ms / 1e3 for ms in _SAFE_MS)
@@ -248,10 +254,10 @@ def ascending_note(times: Sequence[MeasuredTimes]) -> str | None:
     ]
     if not names:
         return None
-    which = ", ".join(map(repr, names[:3])) + (", ..." if len(names) > 3 else "")
     return (
-        f"times ascend from row to row in {len(names)} of {len(times)} sequences ({which}); if "
-        f"they are since the start, --time-unit {CUMULATIVE}s, -ms, -us or -ns says so"
+        f"times ascend from row to row in {len(names)} of {len(times)} sequences "
+        f"({listed(names, 3)}); if they are since the start, --time-unit {CUMULATIVE}s, -ms, "
+        "-us or -ns says so"
     )
 
 

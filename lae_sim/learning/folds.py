@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.annotations import video_of
+from lae_sim.datasets.names import video_of
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import lanes_of
 from lae_sim.evaluation.pairing import histories, pair, pairs

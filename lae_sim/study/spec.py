@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from lae_sim.decoding import within_budget
+from lae_sim.decoding import Budget, read_bytes
 from lae_sim.engine.clock import exact, parse_duration, parse_fps, split_init, whole
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
@@ -206,9 +206,8 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     if not isinstance(path, (str, os.PathLike)):
         raise LaeError(f"path: a study is read from a TOML file, not {shown(path)}")
     try:
-        within_budget(path, os.stat(path).st_size)
-        content = Path(path).read_text("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        content = read_bytes(Path(path), Budget(path)).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise LaeError(f"{path}: cannot be read: {error}") from error
     try:
         if _NESTED_KEY.search(content):  # for which tomllib takes the square of its length

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lae_sim.datasets.absence import absence_files, read_visible
+from lae_sim.datasets.absence import Flags, absence_files, read_flags
 
 FRAMES = 6
 BOXES = "1,2,3,4\n" * FRAMES
@@ -21,9 +21,9 @@ def written(folder: Path, files: dict[str, str]) -> Path:
 
 
 def absent(truth: Path, frames: int = FRAMES) -> list[int]:
-    visible, note = read_visible(truth, frames)
-    assert note is None
-    assert visible is not None
+    flags = read_flags({"a": truth}, {"a": frames})
+    assert flags.notes == ()
+    visible = flags.visible["a"]
     assert visible.shape == (frames,)
     return [i for i, seen in enumerate(visible.tolist()) if not seen]
 
@@ -81,7 +81,7 @@ def test_nfs_says_in_its_truth_where_the_target_is_out_of_view(
 def test_without_such_files_nothing_is_said(tmp_path: Path, files: dict[str, str]) -> None:
     truth = written(tmp_path, files)
     assert absence_files(truth) == {}
-    assert read_visible(truth, FRAMES) == (None, None)
+    assert read_flags({"a": truth}, {"a": FRAMES}) == Flags({})
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_without_such_files_nothing_is_said(tmp_path: Path, files: dict[str, str
         ("absence.label", "0\n0\nnan\n0\n0\n0", "line 3: 'nan' is not a number"),
         ("out_of_view.txt", "", "is empty"),
         ("out_of_view.txt", "0,0,0\n0,0\n0", "line 2: 2 columns"),
-        ("out_of_view.txt", "\0", "not a number"),
+        ("out_of_view.txt", "\0", "not a text file"),
     ],
 )
 def test_damaged_flags_are_left_out_and_told(
@@ -106,8 +106,11 @@ def test_damaged_flags_are_left_out_and_told(
 ) -> None:
     """Those of the other files too: half of what is known would be scored as all of it."""
     truth = written(tmp_path, {"full_occlusion.txt": "0,1,0,0,0,0", name: text})
-    visible, note = read_visible(truth, FRAMES)
-    assert visible is None
-    assert note is not None
-    assert note.startswith(f"flags of absence are left out: {tmp_path / name}")
+    other = written(tmp_path / "b", {"full_occlusion.txt": "1,0,0,0,0,0"})
+    flags = read_flags({"a": truth, "b": other}, {"a": FRAMES, "b": FRAMES})
+    assert list(flags.visible) == ["b"]
+    (note,) = flags.notes
+    assert note.startswith(
+        f"flags of absence of 1 of 2 sequences are left out, such as {tmp_path / name}"
+    )
     assert reason in note

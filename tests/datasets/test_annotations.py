@@ -1,6 +1,4 @@
-import re
 import tempfile
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lae_sim.datasets.annotations import (
-    Attributes,
-    find_truth,
-    read_attributes,
-    read_lost,
-    read_truth,
-    read_vatic,
-)
+from lae_sim.datasets.annotations import find_truth, read_truth
+from lae_sim.datasets.attributes import read_attributes
+from lae_sim.datasets.nfs import read_lost
 from lae_sim.errors import LaeError
 
 BOXES = "10,20,30,40\n11,21,30,40\n"
@@ -121,79 +114,6 @@ def test_rows_of_vot_without_a_target(tmp_path):
     assert boxes[[0, 4]].tolist() == [[0, 1, 6, 7], [0, 1, 6, 7]]
 
 
-def vatic(boxes, first=0, **more):
-    """Rows of VATIC of boxes x, y, w, h."""
-    lost = more.get("lost", ())
-    rows = [
-        f'0 {x} {y} {x + w} {y + h} {first + k} {int(k in lost)} 0 1 "soccer ball"'
-        for k, (x, y, w, h) in enumerate(boxes)
-    ]
-    return "\n".join(rows) + "\n"
-
-
-WAY = [[10 + 3 * k, 20, 30, 40 + k] for k in range(17)]
-
-
-def test_nfs_as_it_is_downloaded(tmp_path):
-    files = [f"NfS/{name}/{rate}/{name}.txt" for name in ("ball", "bee_1") for rate in (30, 240)]
-    root = make(tmp_path, *files, text=vatic(WAY)) / "NfS"
-    with pytest.raises(LaeError, match=r"NfS at 30 and 240 frames per second: .*--fps 30 or"):
-        find_truth(root)
-    with pytest.raises(LaeError, match="NfS at 30 and 240 frames per second, not at 25"):
-        find_truth(root, Fraction(25))
-    for fps in (30, 240):
-        truth = find_truth(root, Fraction(fps))
-        assert (truth.dataset, list(truth.files), truth.fps) == ("NfS", ["ball", "bee_1"], fps)
-        assert truth.files["ball"] == root / "ball" / str(fps) / "ball.txt"
-    assert find_truth(root / "ball", Fraction(30)).dataset == "NfS"
-    assert find_truth(root / "ball" / "240" / "ball.txt").fps == 240
-
-
-def test_nfs_of_30_frames_per_second_is_every_eighth_row(tmp_path):
-    root = make(tmp_path, "b/30/b.txt", "b/240/b.txt", text=vatic(WAY, first=1))
-    slow, fast = root / "b" / "30" / "b.txt", root / "b" / "240" / "b.txt"
-    assert read_truth(fast).tolist() == read_truth(fast, 17).tolist() == WAY
-    assert read_truth(slow, 3).tolist() == [WAY[0], WAY[8], WAY[16]]
-    assert read_truth(slow, 2).tolist() == [WAY[0], WAY[8]]  # the last image is missing
-    one_more = read_truth(slow, 4)
-    assert one_more[:3].tolist() == [WAY[0], WAY[8], WAY[16]]
-    assert np.isnan(one_more[3]).all()
-    make(tmp_path, "c/30/c.txt", text=vatic(WAY, lost=(8, 9)))
-    assert read_lost(tmp_path / "c/30/c.txt", 4).tolist() == [False, True, False, False]
-    assert read_lost(make(tmp_path, "d.txt") / "d.txt", 2) is None
-    with pytest.raises(LaeError, match="is of 240 too: --fps 240"):
-        read_truth(slow, 17)
-    make(tmp_path, "b/30/b.txt", text=vatic(WAY[::8]))  # as somebody thinned it out
-    assert read_truth(slow, 3).tolist() == [WAY[0], WAY[8], WAY[16]]
-
-
-def test_vatic(tmp_path):
-    text = vatic(WAY[:5], lost=(1, 2))
-    boxes, lost = read_vatic(tmp_path / "a.txt", text.splitlines())
-    assert boxes.tolist() == WAY[:5]
-    assert lost.tolist() == [False, True, True, False, False]
-    gap = text.splitlines()[:2] + text.splitlines()[3:]
-    boxes, lost = read_vatic(tmp_path / "a.txt", gap)
-    assert np.isnan(boxes[2]).all()
-    assert boxes[3:].tolist() == WAY[3:5]
-    assert lost.tolist() == [False, True, False, False, False]
-
-
-@pytest.mark.parametrize(
-    ("row", "problem"),
-    [
-        ("1,2,3,4", "line 3: not a row of VATIC as line 1 is"),
-        ('1 1 2 3 4 2 0 0 0 "x"', r"line 3: another target \(id 1\)"),
-        ('0 1 2 3 4 1 0 0 0 "x"', "line 3: frame 1 is there twice"),
-        ('0 1 2 3 4 999999999 0 0 0 "x"', "frames up to 999999999, of which it has 3"),
-    ],
-)
-def test_bad_vatic(tmp_path, row, problem):
-    make(tmp_path, "a.txt", text=vatic(WAY[:2]) + row)
-    with pytest.raises(LaeError, match=problem):
-        read_truth(tmp_path / "a.txt")
-
-
 ROWS = [
     "1,2,3,4",
     "1\t2\t3\t4",
@@ -291,66 +211,6 @@ def test_bad_truth(tmp_path, text, problem):
         read_truth(tmp_path / "a.txt")
 
 
-def test_attributes_csv(tmp_path):
-    make(tmp_path, "D/anno/a.txt", "D/anno/b.txt")
-    make(tmp_path, "D/attributes.csv", text="sequence,Occlusion,Fast motion\na,1,0\nb,1,1\nc,0,0\n")
-    expected = {"a": ("Occlusion",), "b": ("Occlusion", "Fast motion")}
-    assert read_attributes(find_truth(tmp_path / "D")) == Attributes(expected)
-    assert read_attributes(find_truth(tmp_path / "D" / "anno")) == Attributes(expected)
-
-
-@pytest.mark.parametrize(
-    ("truth", "flags", "count", "first"),
-    [
-        ("UAV123/anno/UAV123/bike1.txt", "UAV123/anno/UAV123/att/bike1.txt", 12, "Scale variation"),
-        ("DTB70/anno/bike1.txt", "DTB70/anno/att/bike1.txt", 11, "Scale variation"),
-        ("UAVDT/anno/bike1_gt.txt", "UAVDT/att/bike1_att.txt", 9, "Background clutter"),
-        ("V/annotations/bike1.txt", "V/attributes/bike1_attr.txt", 12, "Aspect Ratio Change"),
-    ],
-)
-def test_official_attribute_folders(tmp_path, truth, flags, count, first):
-    make(tmp_path, truth)
-    make(tmp_path, flags, text=",".join(["1"] + ["0"] * (count - 1)) + "\n")
-    found = find_truth(tmp_path / truth.split("/")[0])
-    assert list(found.files) == ["bike1"]
-    assert read_attributes(found) == Attributes({"bike1": (first,)})
-    make(tmp_path, flags, text="1,0,1\n")
-    left_out = read_attributes(found)
-    assert left_out.of == {}
-    (note,) = left_out.notes
-    assert note.startswith(f"attributes of 1 of 1 sequences are left out, such as {tmp_path}")
-    assert re.search(rf"needs .*\b{count}\b.* flags 0 or 1\Z", note)
-
-
-@pytest.mark.parametrize(
-    "text", ["sequence,A\na,2\n", "sequence,A\na\n", "sequence,A\na,yes\n", ""]
-)
-def test_damaged_attributes(tmp_path, text):
-    make(tmp_path, "a.txt")
-    make(tmp_path, "attributes.csv", text=text)
-    attributes = read_attributes(find_truth(tmp_path))
-    assert attributes.of == {}
-    assert attributes.notes[0].startswith(f"attributes are left out: {tmp_path / 'attributes.csv'}")
-
-
-def test_one_damaged_file_of_flags_costs_its_own_sequence_only(tmp_path):
-    make(tmp_path, "anno/a.txt", "anno/b.txt")
-    make(tmp_path, "anno/att/a.txt", text="0,1,0,1,0,1,0,0,1,0,1\n")
-    make(tmp_path, "anno/att/b.txt", text="<html>")
-    attributes = read_attributes(find_truth(tmp_path))
-    # the official order: perfPlot.m of https://github.com/flyers/drone-tracking, then motion blur
-    assert attributes.of == {
-        "a": (
-            "Aspect ratio variation",
-            "Deformation",
-            "In-plane rotation",
-            "Background clutter",
-            "Motion blur",
-        )
-    }
-    assert "b.txt: looks like a web page" in attributes.notes[0]
-
-
 @pytest.mark.parametrize(
     ("dataset", "sequences", "frames", "attributes"),
     [
@@ -368,12 +228,3 @@ def test_real_datasets(shared_data, dataset, sequences, frames, attributes):
     found = read_attributes(truth).of
     assert len(found) == (sequences if attributes else 0)
     assert len({name for names in found.values() for name in names}) == attributes
-
-
-def test_attributes_without_a_header_are_left_out(tmp_path):
-    make(tmp_path, "a.txt", text="1,2,3,4\n")
-    make(tmp_path, "attributes.csv", text="\n\n")
-    (note,) = read_attributes(find_truth(tmp_path)).notes
-    assert note.endswith(
-        "attributes.csv, line 1: needs a header: sequence, and the attributes' names"
-    )

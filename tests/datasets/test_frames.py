@@ -39,7 +39,7 @@ def test_grey_and_16_bit_images_become_colour_of_8_bit(tmp_path, suffix):
 def test_an_image_that_would_take_too_much_memory(tmp_path, suffix):
     path = tmp_path / f"1.{suffix}"
     cv2.imwrite(str(path), np.zeros((600, 700, 3), np.uint8))
-    with max_decoded(3 * 600 * 700):
+    with max_decoded(3 * 600 * 700 + 54):  # the head of a BMP
         assert read_image(path).shape == (600, 700, 3)
     with (
         max_decoded("1MiB"),
@@ -89,7 +89,7 @@ def test_the_orientation_in_the_metadata_is_ignored(tmp_path, picture):
 
 
 def test_missing_image(tmp_path):
-    with pytest.raises(LaeError, match=r"1\.jpg: cannot be read: No such file"):
+    with pytest.raises(LaeError, match=r"1\.jpg: no such file"):
         read_image(tmp_path / "1.jpg")
 
 

@@ -321,5 +321,5 @@ def test_flags_of_absence_and_what_is_wrong_with_them(tmp_path):
     assert flags[0].tolist() == [True, True, False, True]
     assert flags[1:] == [None, None]
     [note] = dataset.notes
-    assert note.startswith("sequence 'boat-2': flags of absence are left out: ")
+    assert note.startswith("flags of absence of 1 of 3 sequences are left out, such as ")
     assert note.endswith("out_of_view.txt: 3 flags, and there are 4 frames")

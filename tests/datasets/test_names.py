@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lae_sim.datasets.names import Reading, SequenceNames
+from lae_sim.datasets.names import ResultsName, SequenceNames
 from lae_sim.errors import LaeError
 
 OTB = ["Tiger1", "bike1", "Jogging-1", "Jogging-2", "Human4-2", "person1", "person1_s"]
@@ -38,7 +38,7 @@ OTB = ["Tiger1", "bike1", "Jogging-1", "Jogging-2", "Human4-2", "person1", "pers
 def test_a_name_means_a_sequence_and_perhaps_a_tracker(
     written: str, sequence: str, tracker: str | None
 ) -> None:
-    assert SequenceNames(OTB).read(written) == Reading(sequence, tracker)
+    assert SequenceNames(OTB).read(written) == ResultsName(sequence, tracker)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_a_name_that_fits_nothing(written: str) -> None:
 def test_what_fits_as_it_stands_comes_first() -> None:
     names = SequenceNames(["car", "Car", "car_1", "car-1", "uav_car"])
     for name in ("car", "Car", "car_1", "car-1", "uav_car"):
-        assert names.read(name) == Reading(name)
+        assert names.read(name) == ResultsName(name)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +70,6 @@ def test_two_sequences_that_fit_as_well_are_a_question(written: str, known: list
 
 def test_the_tracker_that_is_asked_for_tells_splits_apart() -> None:
     names = SequenceNames(["person1", "person1_s"])
-    assert names.read("person1_s_KCF", "s_KCF") == Reading("person1", "s_KCF")
-    assert names.read("person1_s_KCF", "KCF") == Reading("person1_s", "KCF")
-    assert names.read("person1_s", "s") == Reading("person1_s")
+    assert names.read("person1_s_KCF", "s_KCF") == ResultsName("person1", "s_KCF")
+    assert names.read("person1_s_KCF", "KCF") == ResultsName("person1_s", "KCF")
+    assert names.read("person1_s", "s") == ResultsName("person1_s")

@@ -101,14 +101,23 @@ def test_what_follows_a_sequence_is_no_tracker_beside_files_that_name_none(folde
     for name in ("a", "b", "b_MY", "c_s"):
         np.savetxt(results / f"{name}.txt", BOXES + len(name), "%g", ",")
     settings: dict[str, Any] = {"time": "mean-fps:20"}
-    with pytest.raises(LaeError, match="no ground truth for b_MY, c_s, of 4 results; --skip-miss"):
+    refused = (
+        "no ground truth for b_MY, c_s, of 4 results; --skip-missing leaves them out, "
+        "--tracker MY takes its own alone"
+    )
+    with pytest.raises(LaeError, match=refused):
         convert_results(results, folder / "D", **settings)
+    with pytest.raises(LaeError, match=refused):  # a name for them, and b_MY is still no sequence
+        convert_results(results, folder / "D", tracker="mine", **settings)
     trace, summary = convert_results(results, folder / "D", skip_missing=True, **settings)
     assert (summary.tracker, trace.names) == ("kcf", ("a", "b"))
     assert summary.without_truth == ["b_MY", "c_s"]
     trace, summary = convert_results(results, folder / "D", tracker="MY", **settings)
     np.testing.assert_array_equal(trace["b"].boxes[1:], BOXES[1:] + 4)
     assert (trace.names, summary.tracker) == (("b",), "MY")
+    assert summary.notes == [
+        "results whose names tell no tracker are left out beside those of MY: a, b"
+    ]
 
 
 def test_names_say_which_tracker_it_was(folder: Path) -> None:
@@ -160,6 +169,8 @@ def test_the_last_box_stands_where_the_tracker_has_none(folder: Path) -> None:
     np.testing.assert_array_equal(trace["a"].boxes, held)
     assert summary.held == {"a": 2}
     assert summary.row_0_from_truth == []
+    entries = trace.metadata.document["sequences"]
+    assert {name: entry["lost"] for name, entry in entries.items()} == {"a": 2, "b": 0, "c": 0}
     np.savez(folder / "TLD.npz", a=boxes * np.nan)
     with pytest.raises(LaeError, match="'a': holds no box at all"):
         convert_results(folder / "TLD.npz", folder / "D", time="mean-fps:20")

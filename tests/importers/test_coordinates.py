@@ -139,6 +139,8 @@ def test_row_0_is_the_truth_only_where_it_was_far_off(folder: Path) -> None:
     np.testing.assert_array_equal(trace["a"].boxes, np.vstack([TRUTH[:1], BOXES[1:]]))
     np.testing.assert_array_equal(trace["b"].boxes, near)
     assert summary.row_0_from_truth == ["a"]
+    entries = trace.metadata.document["sequences"]
+    assert [name for name, entry in entries.items() if "row_0_from_truth" in entry] == ["a"]
 
 
 def test_other_coordinates_are_refused(folder: Path) -> None:

@@ -191,5 +191,5 @@ def test_what_was_understood_is_said():
 def test_times_that_ascend_though_they_are_said_to_be_of_each_frame():
     sums = np.arange(1, 10) * 10**6
     note = ascending_note([MeasuredTimes("a", Path("a.txt"), sums, "ms"), *files(0.02)])
-    assert note.startswith("times ascend from row to row in 1 of 2 sequences ('a'); if they are")
+    assert note.startswith("times ascend from row to row in 1 of 2 sequences (a); if they are")
     assert ascending_note([MeasuredTimes("a", Path("a.txt"), sums, "cumulative-ms")]) is None

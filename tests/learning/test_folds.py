@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from witness import moving, psi, schedule_latest, worlds
 
 from lae_sim.comparison.forecasters import score_forecasters
-from lae_sim.datasets.annotations import video_of
+from lae_sim.datasets.names import video_of
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate_runs

@@ -138,7 +138,7 @@ def test_dropped_frames_are_a_question(
         == 2
     )
     said = capsys.readouterr().err
-    assert "sequence 'ball': no image number 6 after 5: at 30 frames/s 6, 8, 10, ..." in said
+    assert "sequence 'ball': no image number 6, 8, 10, ...: did" in said
     assert "--frame-times numbers" in said
     assert list(tmp_path.iterdir()) == []
 
@@ -243,7 +243,7 @@ def test_conversions_ask_too_where_images_are_at_hand(
     out = tmp_path / "t.parquet"
     command = [str(results), "--truth", str(ball), "--time", "constant:47ms", "--out", str(out)]
     assert convert.main(command) == 2
-    assert "no image number 6 after 5" in capsys.readouterr().err
+    assert "no image number 6, 8, 10, ..." in capsys.readouterr().err
     assert not out.exists()
     assert convert.main([*command, "--frame-times", "numbers"]) == 0
     assert "Image numbers are missing in ball: each image comes" in capsys.readouterr().out
