@@ -25,6 +25,9 @@ from lae_sim.decoding import Budget, json_memory, read_bytes
 from lae_sim.errors import LaeError, listed, shown
 
 
+_OTHER_NAMES = ("results", "result", "bbox", "bboxes", "boxes", "rects")  # of a table of boxes
+
+
 @dataclass(frozen=True)
 class OtbRun:
     """One pass over a sequence.
@@ -88,8 +91,8 @@ def _one_pass(content: Any, where: str) -> Mapping[str, Any]:
     """The run of one pass over the whole sequence (OPE)."""
     runs = content.get("results", content) if isinstance(content, Mapping) else content
     if isinstance(content, Mapping) and "res" not in content:
-        tables = [value for value in content.values() if _is_boxes(value)]
-        if len(tables) == 1:  # under another name, such as bbox
+        tables = [content[name] for name in _OTHER_NAMES if _is_boxes(content.get(name))]
+        if len(tables) == 1:
             runs = {**content, "res": tables[0]}
     if not isinstance(runs, list):
         runs = [runs]
