@@ -24,7 +24,6 @@ from lae_sim._arrays import Floats
 from lae_sim.decoding import Budget, json_memory, read_bytes
 from lae_sim.errors import LaeError, listed, shown
 
-
 _OTHER_NAMES = ("results", "result", "bbox", "bboxes", "boxes", "rects")  # of a table of boxes
 
 

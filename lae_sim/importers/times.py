@@ -101,7 +101,7 @@ def read_times(path: Path, unit: str | None = None, column: int = 0) -> tuple[In
         values.append(Fraction(cell))
         if values[-1] > MAX_INT64:  # in whatever unit
             raise LaeError(f"{path}, line {number}: {cell[:40]} is too long a time")
-    if len(values) > 2 and values == list(range(int(values[0]), int(values[0]) + len(values))):
+    if len(rows[0]) > 1 and _counts(values):
         raise LaeError(
             f"{path}: its column {column + 1} counts the frames, {values[0]} to {values[-1]}: keep "
             "the column of times only"
@@ -117,6 +117,11 @@ def _header_as_one_cell(lines: Sequence[str]) -> list[str]:
     if len(lines) > 1 and first[:1].isalpha() and NUMBER.match(lines[1]):
         return ["_".join(first.split()), *lines[1:]]
     return list(lines)
+
+
+def _counts(values: Sequence[Fraction]) -> bool:
+    """Whether values are those of whole numbers one after the other."""
+    return len(values) >= _FEW_ROWS and all(v == values[0] + k for k, v in enumerate(values))
 
 
 def _is_header(cell: str) -> bool:

@@ -168,7 +168,7 @@ def test_mat_without_a_rate(tmp_path, fps):
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        ({"boxes": BOXES}, "no field 'res'"),
+        ({"mine": BOXES}, "no field 'res'"),
         ({"results": 3.0}, "no field 'res'"),
         ({"res": BOXES[:, :3]}, "3 columns"),
         ({"res": BOXES * 1j}, "table of numbers"),
@@ -177,7 +177,7 @@ def test_mat_without_a_rate(tmp_path, fps):
         ({"results": {"res": BOXES, "len": 3}}, "field 'len' is 3, and 'res' has 2 rows"),
         ({"results": {"res": BOXES, "type": "polar"}}, "type 'polar'; known are rect, ivtaff"),
         ({"results": {"res": BOXES, "type": 4}}, r"boxes of type array\("),
-        ({"rects": BOXES, "fps": 3}, "no field 'res' .*; there is rects, fps"),
+        ({"mine": BOXES, "fps": 3}, "no field 'res' .*; there is mine, fps"),
         ({"res": BOXES * np.nan}, "no box at all"),
         ({"results": np.array([{"res": BOXES}] * 3, dtype=object)}, "holds 3 runs"),
         ({"results": np.empty((0, 0))}, "no field 'res'"),

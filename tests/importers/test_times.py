@@ -123,10 +123,10 @@ def test_a_header_may_name_the_unit(written, header, unit, expected):
 
 def test_a_column_that_counts_the_frames_holds_no_times(written):
     for first in (0, 1):
-        rows = "".join(f"{first + k} {0.02 + k % 2}\n" for k in range(5))
-        with pytest.raises(LaeError, match=f"column 1 counts the frames, {first} to {first + 4}"):
+        rows = "".join(f"{first + k} {0.02 + k % 2}\n" for k in range(6))
+        with pytest.raises(LaeError, match=f"column 1 counts the frames, {first} to {first + 5}"):
             read_times(written(rows), "ms")
-        assert ns(written(rows), column=1) == [20_000_000, 1_020_000_000] * 2 + [20_000_000]
+        assert ns(written(rows), column=1) == [20_000_000, 1_020_000_000] * 3
 
 
 def test_a_header_may_say_that_times_are_since_the_start(written):
