@@ -9,6 +9,7 @@ VOT's long-term and depth challenges (``full-occlusion.tag``, ``out-of-frame.tag
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +19,8 @@ import numpy as np
 from lae_sim._arrays import Bools
 from lae_sim.datasets.attributes import left_out
 from lae_sim.datasets.nfs import read_lost
-from lae_sim.datasets.numbers import read_numbers
-from lae_sim.errors import LaeError
+from lae_sim.datasets.numbers import read_lines
+from lae_sim.errors import LaeError, shown
 
 # The values that a file may hold, and those of them that say that the target is absent.
 _FLAG = (range(2), (1,))
@@ -98,10 +99,12 @@ def _read(truth: Path, frames: int) -> Bools | None:
 
 
 def _absent(path: Path, rule: _Rule, frames: int) -> Bools:
-    values = read_numbers(path).ravel()
+    cells = re.findall(r"[^\s,;]+", " ".join(read_lines(path)))
     known, absent = rule
-    if not np.isin(values, known).all():
-        raise LaeError(f"{path}: flags must be whole numbers from 0 to {known[-1]}")
+    wrong = next((cell for cell in cells if cell not in map(str, known)), None)
+    if wrong is not None:
+        raise LaeError(f"{path}: flags are whole numbers from 0 to {known[-1]}, not {shown(wrong)}")
+    values = np.array(cells, np.int64)
     if path.suffix == ".tag" and len(values) < frames:  # the VOT toolkit takes 0 for the rest
         values = np.pad(values, (0, frames - len(values)))
     if len(values) != frames:

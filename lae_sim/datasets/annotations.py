@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -19,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Floats
-from lae_sim.datasets.foreign import HEAD_BYTES, foreign, foreign_columns
+from lae_sim.datasets.foreign import foreign_columns, foreign_file
 from lae_sim.datasets.nfs import find_nfs, is_vatic, rate_of, read_vatic
 from lae_sim.datasets.numbers import read_lines, read_numbers
 from lae_sim.errors import LaeError, listed
@@ -158,13 +159,10 @@ def _instead(root: Path) -> str | None:
             table = table or path
         if path.suffix.lower() not in _CONTAINERS or not path.is_file():
             continue
-        try:
-            with path.open("rb") as file:
-                other = foreign(file.read(HEAD_BYTES))
-            if other is None and path.suffix.lower() == ".txt":
+        other = foreign_file(path)
+        if other is None and path.suffix.lower() == ".txt":
+            with suppress(LaeError):
                 other = foreign_columns(read_numbers(path, nan=True))
-        except (OSError, LaeError):
-            continue
         if other is not None:
             return f"{path} {other}"
     if table is not None:

@@ -52,13 +52,13 @@ def step_of(numbers: Sequence[int]) -> int:
     return step if median(steps) <= _MOST_STEPS * step else 0
 
 
-def missing(numbers: Sequence[int], most: int = 4) -> list[int]:
-    """The first numbers that are missing, at most so many; none if all steps are equal."""
+def missing(numbers: Sequence[int]) -> list[int]:
+    """The first numbers that are missing, up to four; none if all steps are equal."""
     step = step_of(numbers)
     if not step:
         return []
     gone = (n for a, b in pairwise(numbers) for n in range(a + step, b, step))
-    return list(islice(gone, most))
+    return list(islice(gone, 4))
 
 
 def arrivals(numbers: Sequence[int], fps: Fraction) -> Ints:

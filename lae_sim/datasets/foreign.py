@@ -93,6 +93,16 @@ def foreign(head: bytes) -> Foreign | None:
     return None
 
 
+def foreign_file(path: Path, *own: bytes) -> Foreign | None:
+    """The same of a file; None of one that cannot be opened, or begins as its own format does."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError:
+        return None
+    return None if own and head.startswith(own) else foreign(head)
+
+
 @contextmanager
 def recognised(path: Path, *own: bytes) -> Iterator[None]:
     """Say what a file looks like that cannot be read as what it should be.
@@ -110,12 +120,7 @@ def recognised(path: Path, *own: bytes) -> Iterator[None]:
     except TooLargeError:
         raise
     except LaeError as error:
-        try:
-            with path.open("rb") as file:
-                head = file.read(HEAD_BYTES)
-        except OSError:
-            raise error from None
-        other = None if own and head.startswith(own) else foreign(head)
+        other = foreign_file(path, *own)
         if other is None or other.what == _JSON:
             raise
         raise LaeError(f"{path}: {other}") from error

@@ -264,16 +264,22 @@ def _clip_first(file: Path) -> int:
 def _part(paths: list[Path], first: int | None, length: int, where: str) -> list[Path]:
     """``length`` images from number ``first``, or from the start; none may be missing between."""
     numbers = _numbers(paths)
+    start = 0
     if first is not None:
         if first not in numbers:
             raise LaeError(f"{where}: no image number {first}, where the sequence starts")
         start = numbers.index(first)
-        paths, numbers = paths[start:], numbers[start:]
-    steps = np.diff(numbers[:length])
-    if (steps == 1).any() and (steps != 1).any():
-        gap = numbers[int(np.argmax(steps != 1))]
-        raise LaeError(f"{where}: the image after number {gap} is missing, or there twice")
-    return paths[:length]
+    part = slice(start, start + length)
+    doubtful = [
+        *missing(numbers[part]),
+        *(a for a, b in itertools.pairwise(numbers[part]) if a == b),
+    ]
+    if doubtful:
+        raise LaeError(
+            f"{where}: image number {doubtful[0]} is missing, or there twice, and there are "
+            f"{len(paths)} images for {length} annotations: leave those that are annotated"
+        )
+    return paths[part]
 
 
 def _numbers(paths: Sequence[Path]) -> list[int]:

@@ -424,13 +424,12 @@ def _started(recording: Recording, results: Path) -> Recording:
     truth, boxes = recording.truth, recording.boxes
     other = other_reading(truth, boxes)
     if other is not None:
-        evidence = f"mean IoU {other.iou_as_is:.2f} as x, y, w, h in pixels"
+        evidence = f"mean IoU {other.iou_as_is:.2f} as x, y, w, h"
         if other.iou is not None:
             evidence += f", {other.iou:.2f} so read"
         raise LaeError(
             f"sequence {recording.name!r}: {results} looks like {other.looks_like}: {evidence}; "
-            f"{other.remedy}, in all sequences, or leave this one out with --exclude "
-            f"{recording.name}"
+            f"{other.remedy}, in all sequences, or --exclude {recording.name}"
         )
     if not row_0_is_off(truth, boxes):
         return recording

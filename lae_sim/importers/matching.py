@@ -40,15 +40,15 @@ def match_results(
 ) -> Matched:
     """Match the results of one tracker with the sequences of the ground truth.
 
-    Where files of one tracker, whose names need not say which, lie beside those of others, whose
-    names do, the former are taken, unless those of another are asked for.
+    Results whose names tell no tracker come before those whose names do, unless the tracker that is
+    asked for is one of the latter.
 
     Args:
         path: where the results lie, for messages.
         sources: the results.
         truth: the ground truth.
-        tracker: the one that is asked for: of those that names tell apart, or, where none is
-            called so, a name for the one of which they tell nothing.
+        tracker: the one that is asked for, among those that names tell apart; where none of them is
+            called so, a name for the one of the other results.
         skip_missing: whether results without ground truth are left out instead of refused.
 
     Raises:
@@ -70,7 +70,11 @@ def match_results(
         matched = by_tracker.get(chosen or "", {})
         unnamed = sorted(source.name for source in plain.values())
         if others or plain:
-            missing = [name for name in missing if chosen in (name.split("_", 1)[0], *_tails(name))]
+            missing = [
+                name
+                for name in missing
+                if name.startswith(f"{chosen}_") or name.endswith(f"_{chosen}")
+            ]
     if not matched or (missing and not skip_missing):
         raise LaeError(
             f"{truth.root}: no ground truth for {listed(sorted(missing))}, of {len(sources)} "
@@ -109,11 +113,6 @@ def _by_tracker(
                 f"{reading.sequence!r}; give the folder or file of one tracker"
             )
     return by_tracker, missing
-
-
-def _tails(name: str) -> list[str]:
-    """What stands behind each underscore."""
-    return [name[at + 1 :] for at, character in enumerate(name) if character == "_"]
 
 
 def _one_tracker(

@@ -18,7 +18,7 @@ from zipfile import ZipFile
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.foreign import HEAD_BYTES, Foreign, foreign, foreign_columns, recognised
+from lae_sim.datasets.foreign import Foreign, foreign, foreign_columns, foreign_file, recognised
 from lae_sim.datasets.numbers import read_lines, read_numbers
 from lae_sim.decoding import within_budget
 from lae_sim.errors import LaeError
@@ -208,12 +208,11 @@ def _found_instead(path: Path) -> str:
                     return f"; give the folder of one tracker, such as {folder}"
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     for file in [file for file in files if file.is_file()][:5]:
-        with suppress(OSError), file.open("rb") as opened:
-            other = foreign(opened.read(HEAD_BYTES))
-            if other is not None:
-                return f"; {file.name} {other}"
-            if file.suffix.lower() in (".csv", ".tsv", ".dat", ""):
-                return f"; is {file.name} a table? Name it <seq>.txt, a line x,y,w,h for each frame"
+        other = foreign_file(file)
+        if other is not None:
+            return f"; {file.name} {other}"
+        if file.suffix.lower() in (".csv", ".tsv", ".dat", ""):
+            return f"; is {file.name} a table? Name it <seq>.txt, a line x,y,w,h for each frame"
     return "; give the folder of one tracker"
 
 

@@ -205,7 +205,7 @@ class RowChecker:
             typical = float(np.median(steps)) if len(steps) else 0.0
             if 1 <= typical < _LEAST_TYPICAL_NS:
                 problem = _cause_of_times(f"{typical:g} from frame to frame", typical)
-                self._fail(rows, 1, "arrival_ns", problem)
+                self._fail(rows, int(np.argmax(rows.frame > 0)), "arrival_ns", problem)
         corners = "boxes look like x1, y1, x2, y2; write x, y, w, h"
         truth, boxes = rows.truth[:_SAMPLE_ROWS], rows.boxes[:_SAMPLE_ROWS]
         starts = rows.starts[rows.starts < len(truth)]

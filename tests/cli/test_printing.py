@@ -56,7 +56,7 @@ PRINTING = {
     "show": (HOSTILE,),
     "study": ("study.toml", "--workers", "1", "--no-report"),
     "fidelity": (HOSTILE, "--closed-loop", HOSTILE),
-    "convert": (*CONVERT, "--tracker", "a\x1b[2Jé追"),
+    "convert": (*CONVERT[:-1], "a\x1b[2Jé追.parquet"),
 }
 
 
@@ -118,7 +118,7 @@ def test_all_files_of_a_study_are_utf8_and_safe(folder: Path) -> None:
     assert f"\n'{SEEN}," in texts["summary.csv"]
     assert SEEN in texts["report.html"]
     assert "[red]x[/red] 追" in texts["report.html"]
-    assert r"{[}red]x{[}/red] 追" in texts["ranking.tex"]
+    assert r"{[}red]x{[}bold] 追é" in texts["ranking.tex"]
 
 
 # ------------------------------------------------------------------------------ JSON
@@ -188,7 +188,7 @@ def test_a_full_disk_is_an_error_where_the_result_is_lost(
     monkeypatch.setattr(sys, "stdout", Full())
     assert command(name, *PRINTING[name]) == status
     assert capsys.readouterr().err == said
-    assert name != "convert" or Path("o.parquet").is_file()
+    assert name != "convert" or Path(PRINTING[name][-1]).is_file()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")

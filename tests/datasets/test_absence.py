@@ -94,11 +94,11 @@ def test_without_such_files_nothing_is_said(tmp_path: Path, files: dict[str, str
         ("full_occlusion.txt", "0,0,0,0.5,0,0", "whole numbers from 0 to 1"),
         ("cover.label", "8\n8\n9\n8\n8\n8", "whole numbers from 0 to 8"),
         ("absence.label", "-1\n" * 6, "whole numbers from 0 to 1"),
-        ("absence.label", "0\n0\nno\n0\n0\n0", "line 3: 'no' is not a number"),
-        ("absence.label", "0\n0\nnan\n0\n0\n0", "line 3: 'nan' is not a number"),
+        ("absence.label", "0\n0\nno\n0\n0\n0", "from 0 to 1, not 'no'"),
+        ("absence.label", "0\n0\nnan\n0\n0\n0", "from 0 to 1, not 'nan'"),
         ("out_of_view.txt", "", "is empty"),
-        ("out_of_view.txt", "0,0,0\n0,0\n0", "line 2: 2 columns"),
-        ("out_of_view.txt", "\0", "not a text file"),
+        ("out_of_view.txt", "0,0,0\n0", "4 flags, and there are 6 frames"),
+        ("out_of_view.txt", "\1", "from 0 to 1, not"),
     ],
 )
 def test_damaged_flags_are_left_out_and_told(

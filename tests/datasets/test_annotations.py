@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from annotated import make
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -10,17 +11,6 @@ from lae_sim.datasets.annotations import find_truth, read_truth
 from lae_sim.datasets.attributes import read_attributes
 from lae_sim.datasets.nfs import read_lost
 from lae_sim.errors import LaeError
-
-BOXES = "10,20,30,40\n11,21,30,40\n"
-
-
-def make(root, *files, text=BOXES):
-    for file in files:
-        path = root / file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    return root
-
 
 LAYOUTS = {
     "DTB70": ["DTB70/Animal1/groundtruth_rect.txt", "DTB70/BMX2/groundtruth_rect.txt"],

@@ -1,19 +1,10 @@
 import re
 
 import pytest
+from annotated import make
 
 from lae_sim.datasets.annotations import find_truth
 from lae_sim.datasets.attributes import Attributes, read_attributes
-
-BOXES = "10,20,30,40\n11,21,30,40\n"
-
-
-def make(root, *files, text=BOXES):
-    for file in files:
-        path = root / file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    return root
 
 
 def test_attributes_csv(tmp_path):

@@ -268,7 +268,7 @@ def test_fewer_images_than_annotations(walk):
 def test_a_missing_image_in_the_middle(walk):
     images(walk / "img", "%04d.jpg", range(7, 9))
     (walk / "img" / "0003.jpg").unlink()
-    with pytest.raises(LaeError, match="'walk': the image after number 2 is missing"):
+    with pytest.raises(LaeError, match="'walk': image number 3 is missing"):
         find_dataset(root=walk)
 
 

@@ -2,20 +2,11 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from annotated import make
 
 from lae_sim.datasets.annotations import find_truth, read_truth
 from lae_sim.datasets.nfs import read_lost, read_vatic
 from lae_sim.errors import LaeError
-
-BOXES = "10,20,30,40\n11,21,30,40\n"
-
-
-def make(root, *files, text=BOXES):
-    for file in files:
-        path = root / file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    return root
 
 
 def vatic(boxes, first=0, **more):
