@@ -89,7 +89,8 @@ def read_run(content: Any, where: str) -> OtbRun:
 def _one_pass(content: Any, where: str) -> Mapping[str, Any]:
     """The run of one pass over the whole sequence (OPE)."""
     runs = content.get("results", content) if isinstance(content, Mapping) else content
-    if isinstance(content, Mapping) and "res" not in content:
+    run_or_runs = isinstance(runs, list) or (isinstance(runs, Mapping) and "res" in runs)
+    if isinstance(content, Mapping) and not run_or_runs:
         tables = [content[name] for name in _OTHER_NAMES if _is_boxes(content.get(name))]
         if len(tables) == 1:
             runs = {**content, "res": tables[0]}

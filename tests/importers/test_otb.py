@@ -101,6 +101,8 @@ def test_a_table_of_boxes_under_another_name(name: str) -> None:
         read_run({name: rows.T[:3], "anno": rows}, "f")
     with pytest.raises(LaeError, match="no field 'res'"):
         read_run({"results": rows, "bbox": rows}, "f")
+    run = {"res": rows + 2, "fps": 20.0}
+    assert read_run({"results": run, "bbox": rows}, "f").boxes.tolist() == (rows + 2).tolist()
 
 
 def test_json_of_the_python_toolkit(tmp_path: Path) -> None:
