@@ -179,7 +179,8 @@ def _by_format(path: Path, repetition: int) -> dict[str, list[Source]]:
     if path.is_file():
         files = [path]
     else:
-        files = sorted(file for file in path.iterdir() if file.is_file())
+        visible = (file for file in path.iterdir() if not file.name.startswith("."))
+        files = sorted(file for file in visible if file.is_file())
         run = f"_{repetition:03}"
         repeated = [folder / f"{folder.name}{run}.txt" for folder in sorted(path.iterdir())]
         for file in repeated:

@@ -72,6 +72,9 @@ def test_mean_fps_file(tmp_path):
         LaeError, match="has ECO, KCF, not 'SRDCF'; if it is there under another name"
     ):
         given_times(f"mean-fps:{path}", "SRDCF")
+    write(path, "sequence,fps\na,20\nb,20\na,30\n")
+    with pytest.raises(LaeError, match="line 4: a second row for 'a'"):
+        given_times(f"mean-fps:{path}", "any")
     write(path, "sequence,fps\na,25\n")
     assert given_times(f"mean-fps:{path}", "any").of("a", 7) == 40_000_000
 

@@ -48,6 +48,7 @@ def test_text_with_times(tmp_path, kind, times):
         write(tmp_path / f"{name}.txt", TEXT[kind])
         write(tmp_path / times.format(name), TIMES)
     write(tmp_path / "a_all_boxes.txt", "1 2 3\n")
+    write(tmp_path / "._a.txt", "\0\5\x16")  # as macOS leaves them on other disks
     found, results = read(tmp_path)
     assert found == kind
     assert list(results) == ["a", "b"]
