@@ -119,15 +119,6 @@ def read_bytes(path: Path, budget: Budget) -> bytes:
         raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def within_budget(path: str | os.PathLike[str], size: int) -> None:
-    """Check what a file's content would take in memory, bytes.
-
-    Raises:
-        TooLargeError: if it is too much.
-    """
-    Budget(path).take(size)
-
-
 def json_memory(text: bytes) -> int:
     """What the values of a JSON document take at most in memory, bytes, before they are decoded."""
     return 2 * len(text) + _JSON_VALUE_BYTES * sum(map(text.count, (b",", b":", b"[", b"{")))

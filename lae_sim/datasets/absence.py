@@ -19,7 +19,7 @@ import numpy as np
 from lae_sim._arrays import Bools
 from lae_sim.datasets.attributes import left_out
 from lae_sim.datasets.nfs import read_lost
-from lae_sim.datasets.numbers import read_lines
+from lae_sim.datasets.numbers import NUMBER, read_lines
 from lae_sim.errors import LaeError, shown
 
 # The values that a file may hold, and those of them that say that the target is absent.
@@ -101,10 +101,12 @@ def _read(truth: Path, frames: int) -> Bools | None:
 def _absent(path: Path, rule: _Rule, frames: int) -> Bools:
     cells = re.findall(r"[^\s,;]+", " ".join(read_lines(path)))
     known, absent = rule
-    wrong = next((cell for cell in cells if cell not in map(str, known)), None)
-    if wrong is not None:
-        raise LaeError(f"{path}: flags are whole numbers from 0 to {known[-1]}, not {shown(wrong)}")
-    values = np.array(cells, np.int64)
+    for cell in cells:
+        if not (NUMBER.match(cell) and float(cell) in known):
+            raise LaeError(
+                f"{path}: flags are whole numbers from 0 to {known[-1]}, not {shown(cell)}"
+            )
+    values = np.array(cells, np.float64)
     if path.suffix == ".tag" and len(values) < frames:  # the VOT toolkit takes 0 for the rest
         values = np.pad(values, (0, frames - len(values)))
     if len(values) != frames:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.decoding import Budget, allowing, read_bytes, within_budget
+from lae_sim.decoding import Budget, allowing, read_bytes
 from lae_sim.errors import LaeError
 
 _THREADS = 4
@@ -95,7 +95,7 @@ def read_image(path: Path) -> Image:
     import cv2
 
     data = read_bytes(path, Budget(path))
-    within_budget(path, 3 * math.prod(_declared_size(data)))
+    Budget(path).take(3 * math.prod(_declared_size(data)))
     # Many builds of OpenCV decode a JPEG that was cut off, and fill the rest with grey.
     cut = data.startswith(_JPEG) and data.find(_END, max(data.rfind(_SCAN), 0)) < 0
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION

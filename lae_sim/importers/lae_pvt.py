@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from lae_sim._arrays import Floats
-from lae_sim.decoding import within_budget
+from lae_sim.decoding import Budget
 from lae_sim.engine.clock import NS_PER_SECOND, Clock
 from lae_sim.errors import LaeError, listed, shown
 from lae_sim.importers.pickles import load_plain
@@ -147,8 +147,8 @@ def _check_frames(path: Path, frames: list[int], length: int) -> None:
 def _column(path: Path, content: Mapping[Any, Any], key: str) -> list[tuple[int, Any]]:
     column = content.get(key)
     if isinstance(column, (np.ndarray, list, tuple)):
-        within_budget(
-            path, _OUTPUT_BYTES * (column.size if isinstance(column, np.ndarray) else len(column))
+        Budget(path).take(
+            _OUTPUT_BYTES * (column.size if isinstance(column, np.ndarray) else len(column))
         )
     if isinstance(column, np.ndarray) and column.ndim:
         column = column.tolist()

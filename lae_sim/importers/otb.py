@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -25,19 +24,6 @@ from lae_sim.decoding import Budget, json_memory, read_bytes
 from lae_sim.errors import LaeError, listed, shown
 
 _OTHER_NAMES = ("results", "result", "bbox", "bboxes", "boxes", "rects")  # of a table of boxes
-
-
-@dataclass(frozen=True)
-class OtbRun:
-    """One pass over a sequence.
-
-    Attributes:
-        boxes: ``x, y, w, h`` in pixels, float64 [n, 4]; NaN = lost.
-        mean_fps: mean frames per second, if it is said.
-    """
-
-    boxes: Floats
-    mean_fps: Fraction | None
 
 
 def load_json(path: Path) -> Any:
@@ -55,12 +41,16 @@ def load_json(path: Path) -> Any:
         raise LaeError(f"{path}: not readable JSON: {str(error)[:200]}") from error
 
 
-def read_run(content: Any, where: str) -> OtbRun:
-    """The run that a file holds.
+def read_run(content: Any, where: str) -> tuple[Floats, Fraction | None]:
+    """The run that a file holds: one pass over a sequence.
 
     Args:
         content: of the file: the run, or runs in a list or under ``results``.
         where: the file, for messages.
+
+    Returns:
+        Boxes ``x, y, w, h`` in pixels, float64 [n, 4], NaN where the target is lost; and mean
+        frames per second, if it says so.
 
     Raises:
         LaeError: if it is no run of one pass over the sequence, or a field is missing or damaged.
@@ -82,8 +72,8 @@ def read_run(content: Any, where: str) -> OtbRun:
     if stated not in (None, len(boxes)):
         raise LaeError(f"{where}: field 'len' is {stated:g}, and 'res' has {len(boxes)} rows")
     if fps is None or not (math.isfinite(fps) and fps > 0):
-        return OtbRun(boxes, None)
-    return OtbRun(boxes, Fraction(fps))
+        return boxes, None
+    return boxes, Fraction(fps)
 
 
 def _one_pass(content: Any, where: str) -> Mapping[str, Any]:

@@ -20,7 +20,7 @@ import numpy as np
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.foreign import Foreign, foreign, foreign_columns, foreign_file, recognised
 from lae_sim.datasets.numbers import read_lines, read_numbers
-from lae_sim.decoding import within_budget
+from lae_sim.decoding import Budget
 from lae_sim.errors import LaeError
 from lae_sim.files import check_regular
 from lae_sim.importers.matlab import load_matlab
@@ -143,8 +143,8 @@ def _read_otb(path: Path) -> Results:
     """Read ``res`` and ``fps``, alone or in ``results`` as the OTB toolkit has them."""
     with recognised(path, b"MATLAB", b"\x89HDF"):
         content = load_json(path) if path.suffix.lower() == ".json" else load_matlab(path)
-        run = read_run(content, str(path))
-    return Results(_checked_boxes(run.boxes, str(path)), mean_fps=run.mean_fps)
+        boxes, mean_fps = read_run(content, str(path))
+    return Results(_checked_boxes(boxes, str(path)), mean_fps=mean_fps)
 
 
 def _text_boxes(path: Path) -> Floats:
@@ -254,7 +254,7 @@ def _npz_names(path: Path) -> list[str]:
                 entries = archive.infolist()
         except Exception as error:  # a damaged file can raise anything
             raise LaeError(f"{path}: not a readable .npz file: {error!s:.200}") from error
-    within_budget(path, sum(entry.file_size for entry in entries))
+    Budget(path).take(sum(entry.file_size for entry in entries))
     return [entry.filename.removesuffix(".npy") for entry in entries]
 
 
@@ -265,7 +265,7 @@ def _npz_boxes(path: Path, name: str) -> Floats:
             with archive.open(member) as file:
                 shape, kind = _npy_header(file)
             # as it is stored, and as float64
-            within_budget(path, math.prod(shape) * (kind.itemsize + np.dtype(np.float64).itemsize))
+            Budget(path).take(math.prod(shape) * (kind.itemsize + np.dtype(np.float64).itemsize))
             with archive.open(member) as file:
                 boxes = np.lib.format.read_array(file, allow_pickle=False)
     except (LaeError, MemoryError):

@@ -34,6 +34,7 @@ def absent(truth: Path, frames: int = FRAMES) -> list[int]:
         ({"full_occlusion.txt": "0,0,1,0,0,0", "out_of_view.txt": "0,0,0,1,0,0"}, [2, 3]),
         ({"full_occlusion.txt": "0,1,1,0,0,0,\n"}, [1, 2]),
         ({"out_of_view.txt": "0\n0\n0\n0\n1\n1\n"}, [4, 5]),
+        ({"out_of_view.txt": "0.0\n0.0\n1.000e+00\n0\n1.\n0\n"}, [2, 4]),  # as np.savetxt has it
         ({"out_of_view.txt": "\ufeff0 0 0 0 0 0"}, []),
         ({"absence.label": "0\n0\n0\n1\n0\n0\n"}, [3]),
         ({"cover.label": "8\n7\n1\n0\n8\n8\n"}, [3]),

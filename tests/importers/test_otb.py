@@ -18,7 +18,7 @@ SQUARE = np.array([[10, 50, 50, 10], [20, 20, 60, 60]], float)  # x and y of its
 
 
 def boxes(kind: str, rows: Any, size: Any = None) -> list[list[float]]:
-    return read_run({"res": rows, "type": kind, "tmplsize": size}, "f").boxes.tolist()
+    return read_run({"res": rows, "type": kind, "tmplsize": size}, "f")[0].tolist()
 
 
 def test_ivt_is_a_map_of_the_template_about_its_centre() -> None:
@@ -61,7 +61,7 @@ def test_corners(kind: str) -> None:
 
 def test_a_row_of_nan_is_one_in_any_motion_model() -> None:
     rows = np.vstack([[50, 60, 1, 0, 0, 1], np.full(6, np.nan)])
-    found = read_run({"res": rows, "type": "ivtAff", "tmplsize": [20, 10]}, "f").boxes
+    found = read_run({"res": rows, "type": "ivtAff", "tmplsize": [20, 10]}, "f")[0]
     assert found[0].tolist() == [40, 55, 20, 10]
     assert np.isnan(found[1]).all()
 
@@ -111,9 +111,9 @@ def test_json_of_the_python_toolkit(tmp_path: Path) -> None:
            "tmplsize": [0.0, 0.0], "shiftType": None}  # fmt: skip
     for content in (run, [run], [run, {**run, "res": [[5, 6, 7, 8]]}], {"results": [run]}):
         path.write_text(json.dumps(content))
-        found = read_run(load_json(path), str(path))
-        assert found.mean_fps == Fraction(20)
-        np.testing.assert_array_equal(found.boxes, [[1, 2, 3, 4], [np.nan] * 4])
+        boxes, mean_fps = read_run(load_json(path), str(path))
+        assert mean_fps == Fraction(20)
+        np.testing.assert_array_equal(boxes, [[1, 2, 3, 4], [np.nan] * 4])
 
 
 @pytest.mark.parametrize(
@@ -129,8 +129,8 @@ def test_damaged_json(tmp_path: Path, text: str) -> None:
 def test_numbers_of_any_length_are_read(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text(f'{{"res": [[1, 2, 3, {"4" * 5000}]], "fps": {"1" * 5000}}}')
-    found = read_run(load_json(path), "f")
-    assert (found.boxes[0, 3], found.mean_fps) == (np.inf, None)
+    boxes, mean_fps = read_run(load_json(path), "f")
+    assert (boxes[0, 3], mean_fps) == (np.inf, None)
 
 
 @pytest.mark.parametrize("text", ["[" + "[]," * 20_000 + "0]", '{"a": "%s"}' % ("x" * 600_000)])
