@@ -45,7 +45,7 @@ def read_run(content: Any, where: str) -> tuple[Floats, Fraction | None]:
     """The run that a file holds: one pass over a sequence.
 
     Args:
-        content: of the file: the run, or runs in a list or under ``results``; or in place of ``res``
+        content: of the file: the run, or runs in a list or under ``results``; or, without ``res``,
             one table of boxes that is called ``results``, ``bbox`` or the like.
         where: the file, for messages.
 
