@@ -113,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _convert(arguments: argparse.Namespace) -> None:
     from lae_sim.importers.convert import convert_results
-    from lae_sim.trace.file import check_replaces, write_trace
+    from lae_sim.trace.file import check_replaces, trace_at, write_trace
 
     check_places([arguments.out])
     truth_files = dict(arguments.truth_file)
@@ -143,6 +143,8 @@ def _convert(arguments: argparse.Namespace) -> None:
     check_distinct([arguments.out], summary.files)
     if not arguments.force:
         check_replaces(arguments.out, summary.tracker, summary.dataset)
+    elif trace_at(arguments.out) is None:  # and none of the dataset's files, read or not
+        check_distinct([arguments.out], (arguments.results, arguments.truth))
     write_trace(trace, arguments.out)
     if arguments.json:
         print_json(summary.document(arguments.out))

@@ -42,7 +42,13 @@ _CONTAINERS = (
     ".txt",
     ".html",
     ".mat",
+    ".npy",
+    ".npz",
+    ".pkl",
+    ".xlsx",
+    ".ods",
 )
+_TABLES = (".csv", ".tsv", ".dat")
 _MOST_LOOKED_AT = 2000
 
 
@@ -147,7 +153,10 @@ def _in_sequence_folders(root: Path) -> dict[str, Path]:
 def _instead(root: Path) -> str | None:
     """What lies in a folder without ground truth that is known here, in words."""
     paths = itertools.chain(root.glob("*"), root.glob("*/*"), root.glob("*/gt/gt.txt"))
+    table = None
     for path in itertools.islice(paths, _MOST_LOOKED_AT):
+        if path.suffix.lower() in _TABLES and path.name != "attributes.csv" and path.is_file():
+            table = table or path
         if path.suffix.lower() not in _CONTAINERS or not path.is_file():
             continue
         other = foreign_file(path)
@@ -156,6 +165,8 @@ def _instead(root: Path) -> str | None:
                 other = foreign_columns(read_numbers(path, nan=True))
         if other is not None:
             return f"{path} {other}"
+    if table is not None:
+        return f"is {table} a table? Name it <seq>.txt, a line x,y,w,h for each frame"
     return None
 
 

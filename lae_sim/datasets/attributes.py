@@ -75,7 +75,11 @@ _VISDRONE = (
     "Viewpoint Change",
 )
 
-_ATTRIBUTES_BY_SUFFIX = {"_att": (_UAVDT,), "_attr": (_VISDRONE,), "": (_UAV123, _DTB70)}
+_ATTRIBUTES_BY_SUFFIX = {
+    "_att": (_UAVDT,),
+    "_attr": (_VISDRONE,),
+    "": (_UAV123, _DTB70, _DTB70[:10]),
+}
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,17 @@ _DIGITS = re.compile("[0-9]+")
 _MOST_STEPS = 10  # a typical step beyond which numbers count something else, such as milliseconds
 
 
-def image_number(stem: str) -> int:
-    """The number of an image, the last one in its name without the ending; -1 without any."""
-    return int("".join(_DIGITS.findall(stem)[-1:]) or -1)
+def numbers_in(stems: Sequence[str]) -> list[int]:
+    """The number of each image, from the names without their endings; -1 without any.
+
+    It is the last number in the name that is not the same in all of them: in ``cam2_0007_640x480``
+    it is 7.
+    """
+    found = [_DIGITS.findall(stem) for stem in stems]
+    if len({len(each) for each in found}) == 1:
+        changing = [at for at, column in enumerate(zip(*found)) if len(set(column)) > 1]
+        found = [[each[at] for at in changing] or each for each in found]
+    return [int("".join(each[-1:]) or -1) for each in found]
 
 
 def step_of(numbers: Sequence[int]) -> int:

@@ -22,7 +22,7 @@ from lae_sim._arrays import Floats
 from lae_sim.datasets.absence import read_flags
 from lae_sim.datasets.annotations import find_truth, read_truth
 from lae_sim.datasets.attributes import read_attributes
-from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, image_number, missing, note
+from lae_sim.datasets.dropped import arrivals, ask, check_frame_times, missing, note, numbers_in
 from lae_sim.datasets.frames import Dataset, Image, ImageSequence, Video, read_image
 from lae_sim.datasets.names import SequenceNames
 from lae_sim.datasets.synthetic import synthetic_dataset
@@ -283,7 +283,7 @@ def _part(paths: list[Path], first: int | None, length: int, where: str) -> list
 
 
 def _numbers(paths: Sequence[Path]) -> list[int]:
-    return [image_number(path.stem) for path in paths]
+    return numbers_in([path.stem for path in paths])
 
 
 def _list_images(folder: Path) -> list[Path]:

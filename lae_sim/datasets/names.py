@@ -84,9 +84,10 @@ class SequenceNames:
         for guess in (written, bare):
             if _folded(guess) in self._alike:
                 return self._alike[_folded(guess)]
-        targets = [f"{bare}-{number}" for number in (1, 2)]  # OTB: two targets in one video
-        known = [name for name in targets if name in self._names]
-        return known if targets[1] in known else []
+        first, second = (  # OTB: two targets in one video
+            self._alike.get(_folded(f"{bare}-{number}"), []) for number in (1, 2)
+        )
+        return [*first, *second] if second else []
 
 
 def _splits(written: str) -> list[tuple[str, str]]:

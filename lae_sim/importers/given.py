@@ -90,8 +90,10 @@ def frame_ns(fps: Fraction) -> int:
     """The time of one frame at a mean rate, ns, rounded half to even.
 
     Raises:
-        LaeError: if a frame takes too long.
+        LaeError: if a frame takes too long, or less than 1 ns.
     """
+    if fps > 10**9:
+        raise LaeError(f"a mean of more than {10**9:,} fps: a frame takes 1 ns at least")
     return fitting(round(10**9 / fps), f"a mean of {float(fps):g} fps")
 
 
@@ -109,9 +111,15 @@ def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | 
             f"{path}: has {listed(trackers)}, not {shown(tracker)}; if it is there under another "
             "name, give that with --tracker"
         )
+    seen = set()
     for number, row in enumerate(rows, 2):
         if row.get("tracker", tracker) != tracker:
             continue
+        if row["sequence"] in seen:
+            raise LaeError(
+                f"{path}, line {number}: a second row for {shown(row['sequence'])}; keep one"
+            )
+        seen.add(row["sequence"])
         try:
             frames = int(row["frames"]) if row.get("frames") else None
             yield row["sequence"], (frames, frame_ns(parse_fps(row["fps"] or "")))

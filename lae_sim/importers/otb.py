@@ -23,6 +23,8 @@ from lae_sim._arrays import Floats
 from lae_sim.decoding import Budget, json_memory, read_bytes
 from lae_sim.errors import LaeError, listed, shown
 
+_OTHER_NAMES = ("results", "result", "bbox", "bboxes", "boxes", "rects")  # of a table of boxes
+
 
 def load_json(path: Path) -> Any:
     """The values of a JSON file.
@@ -43,7 +45,8 @@ def read_run(content: Any, where: str) -> tuple[Floats, Fraction | None]:
     """The run that a file holds: one pass over a sequence.
 
     Args:
-        content: of the file: the run, or runs in a list or under ``results``.
+        content: of the file: the run, or runs in a list or under ``results``; or, without ``res``,
+            one table of boxes that is called ``results``, ``bbox`` or the like.
         where: the file, for messages.
 
     Returns:
@@ -77,6 +80,11 @@ def read_run(content: Any, where: str) -> tuple[Floats, Fraction | None]:
 def _one_pass(content: Any, where: str) -> Mapping[str, Any]:
     """The run of one pass over the whole sequence (OPE)."""
     runs = content.get("results", content) if isinstance(content, Mapping) else content
+    run_or_runs = isinstance(runs, list) or (isinstance(runs, Mapping) and "res" in runs)
+    if isinstance(content, Mapping) and not run_or_runs:
+        tables = [content[name] for name in _OTHER_NAMES if _is_boxes(content.get(name))]
+        if len(tables) == 1:
+            runs = {**content, "res": tables[0]}
     if not isinstance(runs, list):
         runs = [runs]
     for run in runs:
@@ -92,6 +100,10 @@ def _one_pass(content: Any, where: str) -> Mapping[str, Any]:
         )
     first: Mapping[str, Any] = runs[0]
     return first
+
+
+def _is_boxes(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] == 4 < value.size
 
 
 def _table(value: Any) -> Floats:

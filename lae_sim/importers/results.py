@@ -179,7 +179,8 @@ def _by_format(path: Path, repetition: int) -> dict[str, list[Source]]:
     if path.is_file():
         files = [path]
     else:
-        files = sorted(file for file in path.iterdir() if file.is_file())
+        visible = (file for file in path.iterdir() if not file.name.startswith("."))
+        files = sorted(file for file in visible if file.is_file())
         run = f"_{repetition:03}"
         repeated = [folder / f"{folder.name}{run}.txt" for folder in sorted(path.iterdir())]
         for file in repeated:
@@ -231,7 +232,7 @@ def _text_format(sources: list[Source]) -> str:
 def _checked_boxes(boxes: Any, where: str) -> Floats:
     if not (isinstance(boxes, np.ndarray) and boxes.dtype.kind in "iuf" and boxes.ndim == 2):
         raise LaeError(f"{where}: boxes must be a table of numbers")
-    if boxes.shape[1] != 4:
+    if boxes.shape[1] != 4 and not np.isnan(boxes).all():
         raise LaeError(f"{where}: {boxes.shape[1]} columns; boxes have 4: x, y, w, h")
     table = boxes.astype(np.float64, copy=False)
     lost = np.isnan(table).all(axis=1)
@@ -242,7 +243,7 @@ def _checked_boxes(boxes: Any, where: str) -> Floats:
             "write NaN in all four columns"
         )
     if lost.all():
-        raise LaeError(f"{where}: holds no box at all")
+        raise LaeError(f"{where}: holds no box at all; --exclude leaves its sequence out")
     return table
 
 

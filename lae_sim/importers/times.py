@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from lae_sim._arrays import Floats, Ints
-from lae_sim.datasets.numbers import NUMBER, read_cells
+from lae_sim.datasets.numbers import NUMBER, read_cells, read_lines
 from lae_sim.engine.clock import MAX_INT64, UNIT_NS
 from lae_sim.errors import LaeError, hint, listed, shown
 
@@ -86,7 +86,7 @@ def read_times(path: Path, unit: str | None = None, column: int = 0) -> tuple[In
             of each frame ascend like times since the start.
     """
     parse_unit(unit)
-    rows = read_cells(path)
+    rows = read_cells(path, lines=_header_as_one_cell(read_lines(path)))
     if column >= len(rows[0]):
         raise LaeError(f"{path}: has {len(rows[0])} columns of times, not {column + 1}")
     cells = [row[column] for row in rows]
@@ -101,9 +101,27 @@ def read_times(path: Path, unit: str | None = None, column: int = 0) -> tuple[In
         values.append(Fraction(cell))
         if values[-1] > MAX_INT64:  # in whatever unit
             raise LaeError(f"{path}, line {number}: {cell[:40]} is too long a time")
+    if len(rows[0]) > 1 and _counts(values):
+        raise LaeError(
+            f"{path}: its column {column + 1} counts the frames, {values[0]} to {values[-1]}: keep "
+            "the column of times only"
+        )
     if unit is None and looks_cumulative(np.array(values, np.float64)):
         raise LaeError(f"{path}: {_question_of_sums(values)}")
     return _elapsed(values, unit or "s", path, first_line), unit
+
+
+def _header_as_one_cell(lines: Sequence[str]) -> list[str]:
+    """The lines, with a first one such as ``# Time (ms)`` as the name of the only column."""
+    first = lines[0].lstrip("# ")
+    if len(lines) > 1 and first[:1].isalpha() and NUMBER.match(lines[1]):
+        return ["_".join(first.split()), *lines[1:]]
+    return list(lines)
+
+
+def _counts(values: Sequence[Fraction]) -> bool:
+    """Whether values are those of whole numbers one after the other."""
+    return len(values) >= _FEW_ROWS and all(v == values[0] + k for k, v in enumerate(values))
 
 
 def _is_header(cell: str) -> bool:
@@ -169,7 +187,13 @@ def check_seconds(times: Sequence[MeasuredTimes]) -> None:
     Raises:
         LaeError: if they cannot; it asks for the unit.
     """
-    unsaid = [each for each in times if each.unit is None and each.elapsed_ns.any()]
+    unsaid = [each for each in times if each.unit is None]
+    if unsaid and not any(each.elapsed_ns.any() for each in unsaid):
+        raise LaeError(
+            f"{unsaid[0].path}: all times are 0, as if none had been measured: give --time "
+            "constant:47ms, or --time-unit s if they are right"
+        )
+    unsaid = [each for each in unsaid if each.elapsed_ns.any()]
     if not unsaid:
         return
     low, high = (ms / 1e3 for ms in _SAFE_MS)

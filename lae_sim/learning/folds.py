@@ -208,6 +208,9 @@ def assign_folds(sequences: Iterable[str], folds: int = 5, seed: int = 0) -> dic
     for name in sorted(set(sequences)):
         videos.setdefault(video_of(name), []).append(name)
     if len(videos) < 2:
-        raise LaeError("there is only one video: nothing is left to train on if it is scored")
+        raise LaeError(
+            "there is only one video: nothing is left to train on if it is scored; leave out the "
+            "forecasters that are trained: --forecaster kalman"
+        )
     order = sorted(videos, key=lambda video: sha256(f"{seed}\0{video}".encode()).digest())
     return {name: k % folds for k, video in enumerate(order) for name in videos[video]}

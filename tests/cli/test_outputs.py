@@ -42,6 +42,7 @@ def world(tmp_path: Path) -> Path:
         cv2.imwrite(str(images / f"{number:04}.png"), np.zeros((60, 80, 3), np.uint8))
     (tmp_path / "ds" / "car" / "groundtruth_rect.txt").write_text(boxes)
     (results / "car.txt").write_text(boxes)
+    (tmp_path / "own.txt").write_text(boxes)
     (tmp_path / "f.csv").write_text("sequence,fps\ncar,20\n")
     (tmp_path / "g.pt").write_bytes(b"weights")
     (tmp_path / "own.py").write_text("from lae_sim import Hold\n")
@@ -70,7 +71,9 @@ REPLACING = [
     "convert kcf --truth ds --time mean-fps:f.csv --out hard.csv --force",
     "convert kcf --truth ds --time constant:47ms --out kcf/car.txt --force",
     "convert kcf --truth ds --time constant:47ms --out ds/car/groundtruth_rect.txt --force",
-    "convert kcf --truth ds --time constant:47ms --out ds/car/img/0002.png",
+    "convert kcf --truth ds --time constant:47ms --out ds/car/img/0002.png --force",
+    "convert kcf --truth ds --time constant:47ms --truth-file car=own.txt --force"
+    " --out ds/car/groundtruth_rect.txt",
     "convert kcf --truth ds --time constant:47ms --out slow.parquet",
     "replay slow.parquet --forecaster learned:g.pt --events g.pt",
     "replay slow.parquet --forecaster camera+learned:g.pt --root ds --events ds/../g.pt",

@@ -20,6 +20,7 @@ def test_attributes_csv(tmp_path):
     [
         ("UAV123/anno/UAV123/bike1.txt", "UAV123/anno/UAV123/att/bike1.txt", 12, "Scale variation"),
         ("DTB70/anno/bike1.txt", "DTB70/anno/att/bike1.txt", 11, "Scale variation"),
+        ("DTB70/anno/bike1.txt", "DTB70/anno/att/bike1.txt", 10, "Scale variation"),
         ("UAVDT/anno/bike1_gt.txt", "UAVDT/att/bike1_att.txt", 9, "Background clutter"),
         ("V/annotations/bike1.txt", "V/attributes/bike1_attr.txt", 12, "Aspect Ratio Change"),
     ],

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lae_sim.datasets.dropped import arrivals, image_number, missing, step_of
+from lae_sim.datasets.dropped import arrivals, missing, numbers_in, step_of
 from lae_sim.datasets.layouts import find_dataset, image_numbers
 from lae_sim.errors import LaeError
 
@@ -30,7 +30,13 @@ def sequence(
 
 def test_the_number_of_an_image_is_the_last_in_its_name() -> None:
     stems = ["img000012", "cam2_0007", "9", "frame", "0300"]
-    assert [image_number(stem) for stem in stems] == [12, 7, 9, -1, 300]
+    assert numbers_in(stems) == [12, 7, 9, -1, 300]
+
+
+def test_a_number_that_all_names_share_is_not_that_of_the_image() -> None:
+    assert numbers_in(["cam2_0007_640x480", "cam2_0009_640x480"]) == [7, 9]
+    assert numbers_in(["0001_v2"]) == [2]
+    assert numbers_in([]) == []
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,10 @@ def test_archives(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr("a.txt", "1,2,3,4")
     assert str(foreign((tmp_path / "a.zip").read_bytes())).startswith("looks like an archive (zip)")
+    for name, what in (("[Content_Types].xml", "a spreadsheet"), ("car.npy", "a file of NumPy")):
+        with zipfile.ZipFile(tmp_path / "b.zip", "w") as archive:
+            archive.writestr(name, "content")
+        assert str(foreign((tmp_path / "b.zip").read_bytes())).startswith(f"looks like {what}")
     assert str(foreign(b"a.txt".ljust(257, b"\0") + b"ustar\0")).endswith("give the folder")
 
 

@@ -22,6 +22,8 @@ OTB = ["Tiger1", "bike1", "Jogging-1", "Jogging-2", "Human4-2", "person1", "pers
         ("Jogging.1", "Jogging-1", None),
         ("Jogging_2", "Jogging-2", None),
         ("Human4", "Human4-2", None),
+        ("HUMAN4", "Human4-2", None),
+        ("otb_human4_X", "Human4-2", "X"),
         ("bike1_KCF", "bike1", "KCF"),
         ("bike1_KCF_GaussHog", "bike1", "KCF_GaussHog"),
         ("KCF_GaussHog_bike1", "bike1", "KCF_GaussHog"),

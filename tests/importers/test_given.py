@@ -52,7 +52,7 @@ def test_measured_times_are_not_given():
     assert given_times("measured", "any") is None
     for text in ("constant:47", "constant:", "mean-fps:0", "mean-fps:", "fast", "measured:1",
                  "constant:47ms,init=", "constant:47ms,800ms", "mean-fps:120,init=-1s",
-                 "mean-fps:120,30"):  # fmt: skip
+                 "mean-fps:120,30", "mean-fps:1000000000.1"):  # fmt: skip
         with pytest.raises(LaeError):
             given_times(text, "any")
 
@@ -72,6 +72,9 @@ def test_mean_fps_file(tmp_path):
         LaeError, match="has ECO, KCF, not 'SRDCF'; if it is there under another name"
     ):
         given_times(f"mean-fps:{path}", "SRDCF")
+    write(path, "sequence,fps\na,20\nb,20\na,30\n")
+    with pytest.raises(LaeError, match="line 4: a second row for 'a'"):
+        given_times(f"mean-fps:{path}", "any")
     write(path, "sequence,fps\na,25\n")
     assert given_times(f"mean-fps:{path}", "any").of("a", 7) == 40_000_000
 

@@ -92,6 +92,20 @@ def test_what_is_no_pass(run: Any, problem: str) -> None:
         read_run(run, "f")
 
 
+@pytest.mark.parametrize("name", ["results", "bbox", "boxes"])
+def test_a_table_of_boxes_under_another_name(name: str) -> None:
+    rows = np.array([[1.0, 2, 30, 40], [2, 2, 30, 40]])
+    boxes, mean_fps = read_run({name: rows, "fps": 20.0, "anno": rows + 1}, "f")
+    assert (boxes.tolist(), mean_fps) == (rows.tolist(), 20)
+    with pytest.raises(LaeError, match="no field 'res'"):
+        read_run({name: rows.T[:3], "anno": rows}, "f")
+    with pytest.raises(LaeError, match="no field 'res'"):
+        read_run({"results": rows, "bbox": rows}, "f")
+    run = {"res": rows + 2, "fps": 20.0}
+    boxes, _ = read_run({"results": run, "bbox": rows}, "f")
+    assert boxes.tolist() == (rows + 2).tolist()
+
+
 def test_json_of_the_python_toolkit(tmp_path: Path) -> None:
     path = tmp_path / "Boy.json"
     run = {"evalType": "OPE", "fps": 20, "resType": "rect", "res": [[1, 2, 3, 4], [None] * 4],

@@ -48,6 +48,7 @@ def test_text_with_times(tmp_path, kind, times):
         write(tmp_path / f"{name}.txt", TEXT[kind])
         write(tmp_path / times.format(name), TIMES)
     write(tmp_path / "a_all_boxes.txt", "1 2 3\n")
+    write(tmp_path / "._a.txt", "\0\5\x16")  # as macOS leaves them on other disks
     found, results = read(tmp_path)
     assert found == kind
     assert list(results) == ["a", "b"]
@@ -168,7 +169,7 @@ def test_mat_without_a_rate(tmp_path, fps):
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        ({"boxes": BOXES}, "no field 'res'"),
+        ({"mine": BOXES}, "no field 'res'"),
         ({"results": 3.0}, "no field 'res'"),
         ({"res": BOXES[:, :3]}, "3 columns"),
         ({"res": BOXES * 1j}, "table of numbers"),
@@ -177,7 +178,7 @@ def test_mat_without_a_rate(tmp_path, fps):
         ({"results": {"res": BOXES, "len": 3}}, "field 'len' is 3, and 'res' has 2 rows"),
         ({"results": {"res": BOXES, "type": "polar"}}, "type 'polar'; known are rect, ivtaff"),
         ({"results": {"res": BOXES, "type": 4}}, r"boxes of type array\("),
-        ({"rects": BOXES, "fps": 3}, "no field 'res' .*; there is rects, fps"),
+        ({"mine": BOXES, "fps": 3}, "no field 'res' .*; there is mine, fps"),
         ({"res": BOXES * np.nan}, "no box at all"),
         ({"results": np.array([{"res": BOXES}] * 3, dtype=object)}, "holds 3 runs"),
         ({"results": np.empty((0, 0))}, "no field 'res'"),

@@ -112,11 +112,21 @@ def test_what_looks_cumulative(values, cumulative):
         ("seconds", "s", [900_000_000, 800_000_000]),
         ("time", None, [900_000_000, 800_000_000]),
         ("\ufefftime_ns", "ns", [1, 1]),
+        ("# Time (ms)", "ms", [900_000, 800_000]),
+        ("inference time [s]", "s", [900_000_000, 800_000_000]),
     ],
 )
 def test_a_header_may_name_the_unit(written, header, unit, expected):
     times, found = read_times(written(f"{header}\n0.9\n0.8\n"))
     assert (times.tolist(), found) == (expected, unit)
+
+
+def test_a_column_that_counts_the_frames_holds_no_times(written):
+    for first in (0, 1):
+        rows = "".join(f"{first + k} {0.02 + k % 2}\n" for k in range(6))
+        with pytest.raises(LaeError, match=f"column 1 counts the frames, {first} to {first + 5}"):
+            read_times(written(rows), "ms")
+        assert ns(written(rows), column=1) == [20_000_000, 1_020_000_000] * 3
 
 
 def test_a_header_may_say_that_times_are_since_the_start(written):
@@ -151,7 +161,7 @@ def files(*seconds, unit=None):
     ]
 
 
-@pytest.mark.parametrize("seconds", [[0.0005], [0.25], [0], [0.0004, 0.02, 0.3], [0, 0.02]])
+@pytest.mark.parametrize("seconds", [[0.0005], [0.25], [0.0004, 0.02, 0.3], [0, 0.02]])
 def test_times_that_are_seconds(seconds):
     check_seconds(files(*seconds))
 
@@ -173,6 +183,12 @@ def test_times_that_are_perhaps_not_seconds(seconds, choices):
         check_seconds(files(*seconds))
     assert f"--time-unit {choices}" in str(caught.value)
     check_seconds(files(*seconds, unit="s"))
+
+
+def test_times_that_are_all_0_are_asked_about():
+    with pytest.raises(LaeError, match=r"s0\.txt: all times are 0, .*--time constant:47ms"):
+        check_seconds(files(0, 0))
+    check_seconds(files(0, 0, unit="s"))
 
 
 def test_one_file_in_another_unit_is_found():
