@@ -33,7 +33,7 @@ def run_process(*arguments: object, cwd: Path | None = None) -> subprocess.Compl
 def run_here(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run the same in this process, which has imported everything already.
 
-    What is imported from ``cwd`` is forgotten, so that another folder may have its like.
+    Modules of ``cwd`` are imported anew, and forgotten, so that another folder may have their like.
     """
     words = [str(argument) for argument in arguments]
     printed, complaint = io.StringIO(), io.StringIO()
@@ -48,14 +48,18 @@ def run_here(*arguments: object, cwd: Path | None = None) -> subprocess.Complete
 
 @contextlib.contextmanager
 def _in_folder(folder: Path) -> Iterator[None]:
-    before, path, modules = Path.cwd(), list(sys.path), set(sys.modules)
+    before, path = Path.cwd(), list(sys.path)
+    _forget(folder)  # what another test's folder had under the same name
     os.chdir(folder)
     try:
         yield
     finally:
         os.chdir(before)
         sys.path[:] = path
-        for name in set(sys.modules) - modules:
-            file = getattr(sys.modules[name], "__file__", None) or ""
-            if Path(file).parent == folder:
-                del sys.modules[name]
+        _forget(folder)
+
+
+def _forget(folder: Path) -> None:
+    """Forget modules of the names that a folder's have."""
+    for file in folder.glob("*.py"):
+        sys.modules.pop(file.stem, None)

@@ -227,7 +227,7 @@ def test_studies(keys: dict[str, Any], message: str) -> None:
     ("arguments", "message"),
     [
         ({}, "the key 'traces' is missing"),
-        ({"study": "missing.toml"}, "missing.toml: cannot be read"),
+        ({"study": "missing.toml"}, "missing.toml: no such file"),
         ({"study": SLOW}, "name traces by traces=..."),
         ({"study": [SLOW]}, "study: .* name traces by traces=..."),
         ({"study": 3}, "study: 3 is no TOML file"),
