@@ -7,7 +7,6 @@ several rounds are compared. The input has the size of UAV123: 123 sequences, 11
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import statistics
 import subprocess
 import sys
@@ -24,9 +23,7 @@ from filterpy.kalman import KalmanFilter
 from lae_sim import Metadata, Recording, Trace, simulate, write_trace
 from lae_sim.engine import Clock, latest
 from lae_sim.forecast.base import ForecasterFactory, Lanes, defines, forecast
-from lae_sim.learning.folds import Examples
 from lae_sim.learning.registry import load_forecaster
-from lae_sim.learning.trainers import NetworkTrainer
 from lae_sim.report.table import aligned
 
 SEQUENCES, FRAMES = 123, 112_578
@@ -189,17 +186,8 @@ def forecaster_lines(rounds: int) -> list[list[str]]:
     lanes = Lanes(offsets, frames, boxes, np.full((many, 2), np.inf))
     one = boxes[: count + 1].tolist()
     named = ["constant-velocity", "kalman", "kalman-lae-pvt", "kalman:decay=0.99,state=centre"]
-    named += ["least-squares", "g-h", "imm"]
+    named += ["least-squares", "g-h", "imm", "learned", "guarded+kalman"]
     factories = {name: load_forecaster(name) for name in named}
-    if importlib.util.find_spec("torch"):
-        examples = Examples(
-            ("s",),
-            lanes.chosen(np.arange(many) == 0, np.arange(0))[0],
-            np.arange(count),
-            frames[1 : count + 1],
-            *(boxes[1 : count + 1] for _ in range(2)),
-        )
-        factories["learned"] = NetworkTrainer(steps=1).fit(examples)
 
     def streaming(factory: ForecasterFactory) -> None:
         forecaster = factory(one[0], None)

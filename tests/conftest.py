@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import pytest
 from hypothesis import HealthCheck, settings
 from places import REPOSITORY, SHARED
 
-from lae_sim.engine.clock import Clock
 from lae_sim.trace.metadata import Metadata
 
 settings.register_profile(
@@ -64,20 +62,6 @@ def every_frame() -> Metadata:
 @pytest.fixture(scope="session")
 def torch() -> Any:
     """The torch module on one thread, since several wait for each other on a busy machine."""
-    found = pytest.importorskip("torch", reason="the learned forecaster needs torch")
+    found = pytest.importorskip("torch", reason="training needs torch")
     found.set_num_threads(1)
     return found
-
-
-@pytest.fixture(scope="session")
-def learned(torch: Any) -> Any:
-    """A network that a few steps have trained, on two sequences."""
-    from witness import moving
-
-    from lae_sim.learning.folds import Examples
-    from lae_sim.learning.trainers import NetworkTrainer
-    from lae_sim.replay.run import replay_sequence
-
-    recordings = [moving(60, seed, f"s{seed}") for seed in range(2)]
-    runs = [replay_sequence(recording, Clock.at(Fraction(30))) for recording in recordings]
-    return NetworkTrainer(steps=12, batch=64).fit(Examples.of(runs), seed=3)

@@ -642,7 +642,7 @@ FAULTS = (
             f"replay {SLOW} --forecaster nothing",
             f"replay {SLOW} --forecaster nowhere:Thing",
             f"replay {SLOW} --forecaster tuned-kalman",
-            f"replay {SLOW} --forecaster learned",
+            f"replay {SLOW} --forecaster trained",
             f"replay {SLOW} --forecaster learned:nowhere.pt",
             f"replay {SLOW} --forecaster kalman:q=big",
             f"replay {SLOW} --forecaster kalman:speed=1",

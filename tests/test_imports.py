@@ -119,11 +119,18 @@ evaluate_runs(runs, trace.metadata, {"kalman": load_forecaster("kalman")})
 HEAVY = {"pandas", "torch", "cv2", "matplotlib", "jinja2", "scipy", "filterpy", "IPython"}
 
 
-@pytest.mark.parametrize("program", ["import lae_sim", READ, READ + EVALUATE], ids=range(3))
+LEARNED = {"lae_sim.forecast.learned", "lae_sim.forecast.guard", "lae_sim.forecast.network"}
+
+
+@pytest.mark.parametrize(
+    "program",
+    ["import lae_sim", READ, READ + EVALUATE, READ + EVALUATE.replace("kalman", "learned")],
+    ids=range(4),
+)
 def test_nothing_heavy_is_imported(program: str, tmp_path: Path) -> None:
     path = tmp_path / "trace.parquet"
     write_trace(Trace(Metadata.new("30", "every-frame"), [moving(9)]), path)
-    program += "\nimport sys; print(*{name.partition('.')[0] for name in sys.modules})"
+    program += "\nimport sys; print(*sys.modules)"
     found = subprocess.run(
         [sys.executable, "-W", "error", "-c", program, str(path)],
         cwd=REPOSITORY,
@@ -131,9 +138,11 @@ def test_nothing_heavy_is_imported(program: str, tmp_path: Path) -> None:
         text=True,
         check=True,
     )
-    loaded = set(found.stdout.split())
+    modules = set(found.stdout.split())
+    loaded = {name.partition(".")[0] for name in modules}
     assert "lae_sim" in loaded
     assert not loaded & HEAVY
+    assert modules & LEARNED == (LEARNED if "learned" in program else set())
 
 
 def test_importing_the_package_alone_does_not_import_numpy_or_arrow() -> None:

@@ -219,7 +219,7 @@ def compare_forecasters(
 ) -> ComparisonResult:
     """Which forecaster helps, by how much, and how sure that is.
 
-    Forecasters that must be trained (``"tuned-kalman"``, ``"learned"``, your own trainers) are
+    Forecasters that must be trained (``"tuned-kalman"``, ``"trained"``, your own trainers) are
     trained across folds, and scored only on sequences that they have not seen.
 
     Args:

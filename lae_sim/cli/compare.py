@@ -35,14 +35,14 @@ examples:
   lae-sim compare traces/*.parquet
   lae-sim compare nano.parquet --latency constant:20ms constant:47ms --plot comparison.png
   lae-sim compare nano.parquet --latency constant:47ms,init=800ms by-call,init=1s
-  lae-sim compare nano.parquet --latency-scale 1/2 1 2 4 --forecaster kalman learned --attributes
+  lae-sim compare nano.parquet --latency-scale 1/2 1 2 4 --forecaster learned kalman --attributes
   lae-sim compare nano.parquet --forecaster kalman camera+kalman --root ~/data/DTB70 --out all.csv
   lae-sim compare nano.parquet --latency constant:47ms --search c=0.7 --pre-forecaster kalman
   lae-sim compare nano.parquet dcf.parquet --strided nano.gaps.parquet dcf.gaps.parquet
   lae-sim compare nano.parquet --forecaster kalman mine:Midway --cost mine:Midway=2ms --json
 
 {FORECASTERS}\
-  learned, tuned-kalman   trained here, on other sequences than those they are scored on (k-fold)
+  trained, tuned-kalman   trained here, on other sequences than those they are scored on (k-fold)
   package.module:trainer  your own, with fit(examples, seed) -> factory: the same
 """
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from itertools import count
+from typing import Any
 
 from lae_sim.cli.options import (
     add_worlds,
@@ -17,17 +19,19 @@ from lae_sim.cli.options import (
     print_json,
 )
 from lae_sim.engine.clock import whole
+from lae_sim.errors import LaeError
 from lae_sim.progress import ProgressBar, print_text
 
 PROGRAM = "lae-sim train"
 
 EXAMPLES = """\
 examples:
-  lae-sim train traces/synthetic-slow.parquet --out forecaster.pt
-  lae-sim train DTB70-*.parquet --latency constant:20ms constant:47ms constant:100ms --out f.pt
-  lae-sim replay other.parquet --forecaster kalman learned:f.pt
+  lae-sim train traces/synthetic-slow.parquet --out forecaster.npz
+  lae-sim train DTB70-*.parquet --latency constant:20ms constant:47ms constant:100ms --out f.npz
+  lae-sim replay other.parquet --forecaster kalman learned:f.npz
+  lae-sim train --made-up 8000 --steps 12000 --seed 14 --out learned.npz     # the one that ships
 
-Scores on the sequences that it was trained on promise nothing: lae-sim compare --forecaster learned
+Scores on the sequences that it was trained on promise nothing: lae-sim compare --forecaster trained
 trains across folds, so that no sequence is scored by what has seen it.
 """
 
@@ -40,8 +44,15 @@ def parser() -> argparse.ArgumentParser:
         EXAMPLES,
     )
     add = made.add_argument
-    add("traces", nargs="+", metavar="TRACE", help="traces, better of every frame")
-    add("--out", required=True, metavar="FILE", help="the trained forecaster, such as f.pt")
+    add("traces", nargs="*", metavar="TRACE", help="traces, better of every frame")
+    add(
+        "--made-up",
+        type=argument(partial(whole, least=2)),
+        metavar="N",
+        help="instead of traces, N sequences of made-up motion and a quarter as many with dropped "
+        "frames",
+    )
+    add("--out", required=True, metavar="FILE", help="the trained forecaster, such as f.npz")
     add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
     add("--exclude", nargs="+", default=[], metavar="NAME", help="all sequences but these")
     add(
@@ -66,40 +77,58 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-
     from lae_sim import __version__
     from lae_sim.cli.options import worlds_of
     from lae_sim.forecast.learned import Learned, write_learned
     from lae_sim.learning.folds import Examples
+    from lae_sim.learning.motion import made_up_trace
     from lae_sim.learning.trainers import NetworkTrainer
+    from lae_sim.replay.world import World
     from lae_sim.trace.file import read_trace
     from lae_sim.trace.locate import find_traces
 
-    paths = find_traces(arguments.traces)
-    check_outputs(arguments, [arguments.out], paths)
-    worlds = worlds_of(arguments)
-    traces = [read_trace(path, arguments.sequence) for path in paths]
-    examples = Examples.of_traces(traces, worlds, arguments.exclude)
+    if bool(arguments.traces) == (arguments.made_up is not None):
+        raise LaeError("give traces to train on, or --made-up N")
+    for name in ("sequence", "exclude"):
+        if arguments.made_up and getattr(arguments, name):
+            raise LaeError(f"--{name} goes with traces, not with --made-up")
+    origin: dict[str, Any] = {"lae_sim": __version__}
+    if arguments.made_up:
+        check_outputs(arguments, [arguments.out], [])
+        count_dropped = arguments.made_up // 4
+        traces = [made_up_trace(arguments.made_up, arguments.seed)]
+        if count_dropped:
+            traces.append(made_up_trace(count_dropped, arguments.seed, dropped=True))
+        examples = Examples.of_traces(traces, [World()])
+        origin["made_up"] = arguments.made_up
+    else:
+        paths = find_traces(arguments.traces)
+        check_outputs(arguments, [arguments.out], paths)
+        traces = [read_trace(path, arguments.sequence) for path in paths]
+        examples = Examples.of_traces(traces, worlds_of(arguments), arguments.exclude)
+        origin |= {
+            "traces": paths,
+            "latencies": arguments.latency,
+            "scales": [str(scale) for scale in arguments.latency_scale],
+            "policy": arguments.policy,
+            "sequences": sorted(set(examples.sequences)),
+        }
     made = count(1)
     with ProgressBar("training", "steps") as bar:
         trainer = NetworkTrainer(
             steps=arguments.steps, progress=lambda _: bar(next(made), arguments.steps)
         )
-        rule = trainer.fit(examples, arguments.seed).rule
-    origin = {
-        "lae_sim": __version__,
-        "traces": paths,
-        "latencies": arguments.latency,
-        "scales": [str(scale) for scale in arguments.latency_scale],
-        "policy": arguments.policy,
-    }
-    learned = Learned(rule.network, {**rule.document, **origin})
+        learned = trainer.fit(examples, arguments.seed)
+    document = {**learned.document, "sequences": [], **origin}
+    learned = Learned(replace(learned.network, document=document))
     write_learned(learned, arguments.out)
+    digest = learned.network.digest
     if arguments.json:
-        print_json({"forecaster": arguments.out, **learned.document})
+        print_json({"forecaster": arguments.out, "digest": digest, **document})
         return
     print_text(
         f"{arguments.out}: trained on {len(examples.item):,} queries of "
-        f"{len(learned.trained_on)} sequences, {arguments.steps:,} steps, seed {arguments.seed}\n\n"
+        f"{len(set(examples.sequences)):,} sequences, {arguments.steps:,} steps, seed "
+        f"{arguments.seed}; weights {digest[:16]}\n\n"
         f"next:\n  lae-sim replay OTHER.parquet --forecaster kalman learned:{arguments.out}"
     )

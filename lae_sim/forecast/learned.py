@@ -1,253 +1,332 @@
-"""A learned forecaster (extra ``torch``): a small network over the last outputs.
+"""The learned forecaster: a small network over the last outputs, in NumPy alone.
 
-The network sees the last velocities of the centre, in target sizes per frame, and of the logarithms
-of width and height, with the intervals between them and the frames to look ahead, and answers with
-weights for these velocities and a correction. It starts as a mean of the last three velocities, is
-mirrored in x and y so that no direction is preferred, and predicts at any horizon. A regression on
-past motion is PVT++'s idea (Li et al., "PVT++: A Simple End-to-End Latency-Aware Visual Tracking
-Framework", ICCV 2023, Sec. 4); weights over velocities, and training on the overlap, are new here.
+It sees the last velocities of the target, in target sizes per frame, the intervals between them,
+the target's size, and the first velocities of the sequence, which begin at the truth and so tell
+whether a tracker's boxes are early, late, larger or smaller than it. With every output it answers
+with weights for these velocities and corrections, from which the box at any later frame follows. A
+regression on past motion is PVT++'s idea (Li et al., "PVT++: A Simple End-to-End Latency-Aware
+Visual Tracking Framework", ICCV 2023, Sec. 4); weights over velocities, and training on the overlap
+and on made-up motion, are new here.
+
+Answers are the same bits for one sequence and for thousands, on every processor: the network
+counts in whole numbers (:mod:`lae_sim.forecast.network`), and all else is addition, multiplication,
+division, square roots and rounding, which IEEE 754 defines to the last bit, in one order.
+Logarithms are not defined so: sizes change by r = 2 (b - a) / (b + a), which is about log(b / a),
+and of which b = a (2 + r) / (2 - r) is the inverse.
 """
 
 from __future__ import annotations
 
-import io
 import os
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lae_sim._arrays import Floats
+from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.names import video_of
 from lae_sim.errors import LaeError
-from lae_sim.files import written_whole
-from lae_sim.forecast.window import Window, Windowed
+from lae_sim.forecast.arithmetic import Number, at_least, nearest, root, within
+from lae_sim.forecast.base import Forecaster, ImageSize, Lanes
+from lae_sim.forecast.guard import Guarded
+from lae_sim.forecast.network import ONE, Network, read_network, write_network
 
-FORMAT = "lae-forecaster"
-VERSION = 1
 VELOCITIES = 8
-HIDDEN = 128
-_CORRECTION = 0.05  # target sizes per frame: what an output of 1 stands for
-_MIRRORS = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
-_CONTEXT = 4 * VELOCITIES + 2 * VELOCITIES + 3
+STARTS = 3
+HORIZONS = (2.0, 8.0)
+RATES = 1 + len(HORIZONS)
+SLOPE = 20.0
+CORRECTION = 1 / 16
+OFFSET = 1 / 8
+
+SHIPPED = Path(__file__).with_name("learned.npz")
+"""The weights that come with the package."""
+
+_SEEN = 6  # numbers of each velocity: x, y, w, h, the interval, whether it is known
+INPUTS = _SEEN * (VELOCITIES + STARTS) + 3
+MIXING = 2 * RATES * VELOCITIES
+OUTPUTS = MIXING + 4 * RATES + 4
+_FINE = 2.0**20  # velocities are multiples of its inverse, so that sums of them are exact
+_FASTEST = 8.0
+_PART = 1 << 12  # items at once: windows take much memory, and small ones stay in the cache
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a target is and how large, as numbers or as arrays [n]: pixels, centre, sides >= 1."""
+
+    x: Number
+    y: Number
+    w: Number
+    h: Number
+    size: Number
+
+    @classmethod
+    def of(cls, x: Number, y: Number, w: Number, h: Number) -> Place:
+        """The place of a box."""
+        wide, high = at_least(w, 1.0), at_least(h, 1.0)
+        return cls(x + w * 0.5, y + h * 0.5, wide, high, root(wide * high))
+
+    def chosen(self, which: Ints) -> Place:
+        """Some of the places."""
+        return Place(*(each[which] for each in (self.x, self.y, self.w, self.h, self.size)))
+
+    def velocity(self, before: Place, interval: Number) -> tuple[Number, ...]:
+        """Of the centre in sizes per frame, of the sides as ratios per frame, after an interval."""
+        moves = (
+            (self.x - before.x) / self.size,
+            (self.y - before.y) / self.size,
+            2.0 * (self.w - before.w) / (self.w + before.w),
+            2.0 * (self.h - before.h) / (self.h + before.h),
+        )
+        return tuple(nearest(within(move / interval, _FASTEST) * _FINE) / _FINE for move in moves)
+
+    def shape(self, age: Number) -> tuple[Number, ...]:
+        """What the network sees of it and of the number of outputs so far."""
+        parts = self.size / (self.size + 50.0), self.w / (self.w + self.h), age / (age + 8.0)
+        return tuple(nearest(part * ONE) for part in parts)
+
+    def moved(self, rates: Any, offset: Any, ahead: Number) -> tuple[Number, ...]:
+        """The box so many frames later.
+
+        Args:
+            rates: [RATES][4], of numbers or arrays.
+            offset: [4].
+            ahead: frames, above 0.
+        """
+        near, far = ahead / (ahead + HORIZONS[0]), ahead / (ahead + HORIZONS[1])
+        x, y, w, h = (
+            (rates[0][i] + rates[1][i] * near + rates[2][i] * far) * ahead + offset[i]
+            for i in range(4)
+        )
+        w, h = within(w, 1.0), within(h, 1.0)
+        wide, high = self.w * (2.0 + w) / (2.0 - w), self.h * (2.0 + h) / (2.0 - h)
+        left, top = self.x + x * self.size - wide * 0.5, self.y + y * self.size - high * 0.5
+        return left, top, wide, high
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """The motion that led to each of N outputs.
+
+    Attributes:
+        place: where the target is then, arrays [N].
+        velocity: see :meth:`Place.velocity`, [N, 4]; 0 for the first of a lane.
+        interval: frames since the output before, [N]; 0 for the first of a lane.
+        first: first item of each one's lane, int64 [N].
+    """
+
+    place: Place
+    velocity: Floats
+    interval: Floats
+    first: Ints
+
+    @classmethod
+    def of(cls, lanes: Lanes) -> Past:
+        """The motion of some lanes."""
+        every = np.arange(len(lanes.frames))
+        first = lanes.first(every)
+        before = np.maximum(every - 1, first)
+        place = Place.of(*lanes.boxes.T)
+        interval = (lanes.frames - lanes.frames[before]).astype(np.float64)
+        since = np.where(interval > 0, interval, 1.0)
+        velocity = np.stack(place.velocity(place.chosen(before), since), axis=1)
+        velocity[interval <= 0] = 0.0
+        return cls(place, velocity, np.maximum(interval, 0.0), first)
+
+    def window(self, item: Ints) -> Ints:
+        """The outputs whose motion is seen as of some items, [n, VELOCITIES + STARTS].
+
+        They are the last ones, newest first, and the first ones of the lane. Where there is none it
+        is the lane's first output, which nothing led to.
+        """
+        start = self.first[item, None]
+        last = np.maximum(item[:, None] - np.arange(VELOCITIES), start)
+        opening = start + 1 + np.arange(STARTS)
+        return np.concatenate([last, np.where(opening <= item[:, None], opening, start)], axis=1)
+
+
+def rows_of(velocity: Floats, interval: Floats) -> Floats:
+    """What the network sees of velocities [..., 4] after intervals [...], [..., 6]."""
+    known = np.where(interval > 0, ONE, 0.0)
+    return np.stack([*_row(np.moveaxis(velocity, -1, 0), interval), known], axis=-1)
+
+
+def _row(velocity: Sequence[Number] | Floats, interval: Number) -> tuple[Number, ...]:
+    """What the network sees of a velocity, in its whole numbers."""
+    steep = [SLOPE * each for each in velocity]
+    bent = [each / root(1.0 + abs(each)) for each in steep]
+    return *(nearest(each * ONE) for each in bent), nearest(interval / (interval + 4.0) * ONE)
+
+
+def mirrored(motion: Floats) -> Floats:
+    """By what to multiply x and y so that motions [n, VELOCITIES, 4] go right and down, [n, 2].
+
+    By 0 if they go neither way: of a mirrored world everything is mirrored, of one at rest too.
+    """
+    return np.sign(_FADING @ motion[..., :2])
 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """The rule of a trained network.
+    """The factory of forecasters that go by a network.
 
     Attributes:
-        network: a torch module, from [P, inputs] to [P, outputs].
-        document: what it was trained on and how, as JSON; ``sequences`` names its sequences.
+        network: from ``INPUTS`` numbers to ``OUTPUTS``.
     """
 
-    network: Any
-    document: Mapping[str, Any]
-
-    size = VELOCITIES + 1
+    network: Network
 
     @property
-    def trained_on(self) -> Sequence[str]:
-        """Names of the sequences that it was trained on."""
-        names: Sequence[str] = self.document["sequences"]
-        return names
+    def document(self) -> Mapping[str, Any]:
+        """What it was trained on and how, as JSON; ``sequences`` names real ones."""
+        return self.network.document
 
     def notes(self, sequences: Sequence[str]) -> list[str]:
-        """Whether it was trained on some of these sequences, or on parts of the same videos."""
-        known = {video_of(name) for name in self.trained_on}
+        """Its weights' digest, and whether it was trained on these sequences or their videos."""
+        known = {video_of(name) for name in self.document.get("sequences", ())}
         seen = sum(video_of(name) in known for name in sequences)
-        return [f"trained on {seen} of these {len(sequences)} sequences"] if seen else []
+        notes = [f"weights {self.network.digest[:16]}"]
+        return notes + ([f"trained on {seen} of these {len(sequences)} sequences"] if seen else [])
 
-    def __call__(self, window: Window, ahead: Floats) -> Floats:
-        """Boxes, float64 [P, 4], so many frames [P] after the newest output of each window."""
-        import torch
+    def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Forecaster:
+        """The forecaster of one sequence."""
+        return _Following(self.network, box)
 
-        count = len(ahead)
-        signs = torch.tensor(_MIRRORS).repeat_interleave(count, dim=0)
-        with one_thread(), torch.inference_mode():
-            inputs = Inputs.of(window, ahead).rows(torch.arange(count).repeat(len(_MIRRORS)))
-            change = inputs.stretched(signs).change(self.network)
-            change[:, :2] *= signs
-            mean = change.reshape(len(_MIRRORS), count, 4).mean(0)
-        return _moved(window.boxes[:, 0], mean.numpy().astype(np.float64))
+    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
+        """The same for many lanes at once, to the last bit."""
+        past = Past.of(lanes)
+        rates, offsets = self._outlooks(past)
+        ahead = (frame - lanes.frames[item]).astype(np.float64)
+        boxes = lanes.boxes[item]
+        asked = np.flatnonzero((ahead > 0) & (item > past.first[item]))  # else nothing has moved
+        which = item[asked]
+        moved = past.place.chosen(which).moved(
+            rates[which].transpose(1, 2, 0), offsets[which].T, ahead[asked]
+        )
+        boxes[asked] = np.stack(moved, axis=1)
+        return boxes
+
+    def _outlooks(self, past: Past) -> tuple[Floats, Floats]:
+        """The rates [N, RATES, 4] and offsets [N, 4] after each item."""
+        rows, count = rows_of(past.velocity, past.interval), len(past.first)
+        every = np.arange(count)
+        shape = np.stack(past.place.shape((every - past.first).astype(np.float64)), axis=1)
+        rates, offsets = np.empty((count, RATES, 4)), np.empty((count, 4))
+        for begin in range(0, count, _PART):
+            item = every[begin : begin + _PART]
+            window = past.window(item)
+            motion = past.velocity[window[:, :VELOCITIES]]
+            mirror = mirrored(motion)
+            seen = rows[window]
+            seen[..., :2] *= mirror[:, None]
+            inputs = np.concatenate([seen.reshape(len(item), -1), shape[item]], axis=1)
+            rates[item], offsets[item] = _outlook(self.network(inputs), motion, mirror)
+        return rates, offsets
 
 
-@dataclass(frozen=True, eq=False)
-class Inputs:
-    """What the network sees of P windows; torch tensors, float32.
+_FADING = 0.5 ** np.arange(VELOCITIES)
+"""Weights of the velocities by which a motion is mirrored to go right and down: sums are exact."""
 
-    Attributes:
-        velocities: of centre x and y in target sizes, and of the logarithms of width and height,
-            per frame, newest first, [P, n, 4]; 0 where unknown.
-        intervals: frame intervals between the outputs of each velocity, [P, n]; 0 where unknown.
-        ahead: frames from the newest output to the query, [P].
-        shape: logarithms of the target's size (over 50 px) and aspect, [P, 2].
+_MIRRORS = np.ones((3, 3, INPUTS))
+"""What inputs are multiplied by, for a factor of 0, 1 or -1 of x and of y."""
+for _factor in (0, -1):
+    _MIRRORS[_factor, :, 0:-3:_SEEN] = _factor
+    _MIRRORS[:, _factor, 1:-3:_SEEN] = _factor
+
+
+def _outlook(answers: Floats, motion: Floats, mirror: Floats) -> tuple[Floats, Floats]:
+    """What the network's answers mean; all of it is exact.
+
+    Args:
+        answers: of the network, [n, OUTPUTS].
+        motion: the last velocities, newest first, [n, VELOCITIES, 4].
+        mirror: by what x and y were multiplied, see :func:`mirrored`, [n, 2].
+
+    Returns:
+        Rates [n, RATES, 4] and offsets [n, 4] for :meth:`Place.moved`.
     """
-
-    velocities: Any
-    intervals: Any
-    ahead: Any
-    shape: Any
-
-    @classmethod
-    def of(cls, window: Window, ahead: Floats) -> Inputs:
-        """The inputs of some windows."""
-        import torch
-
-        sides = np.log(np.maximum(window.boxes[..., 2:], 1.0))
-        centres = window.boxes[..., :2] + window.boxes[..., 2:] / 2
-        scale = np.exp(sides[:, :1].mean(axis=2, keepdims=True))
-        states = np.concatenate([centres / scale, sides], axis=2)
-        intervals = (window.frames[:, :-1] - window.frames[:, 1:]) * window.known[:, 1:]
-        velocities = (states[:, :-1] - states[:, 1:]) / np.where(intervals > 0, intervals, 1)[
-            ..., None
-        ]
-        shape = [np.log(scale[:, 0, 0] / 50), sides[:, 0, 0] - sides[:, 0, 1]]
-        parts = (velocities, intervals, np.maximum(ahead, 0), np.stack(shape, axis=1))
-        return cls(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
-
-    def stretched(self, factors: Any) -> Inputs:
-        """The same with the motion in x and y multiplied by factors, [P, 2]; -1 mirrors it."""
-        import torch
-
-        moved = self.velocities[..., :2] * factors[:, None]
-        velocities = torch.cat([moved, self.velocities[..., 2:]], 2)
-        return Inputs(velocities, self.intervals, self.ahead, self.shape)
-
-    def flipped(self, which: Any) -> Inputs:
-        """The same with x and y exchanged in some windows, bool [P]."""
-        import torch
-
-        exchanged = self.velocities[..., [1, 0, 3, 2]]
-        velocities = torch.where(which[:, None, None], exchanged, self.velocities)
-        shape = torch.where(which[:, None], self.shape * torch.tensor([1.0, -1.0]), self.shape)
-        return Inputs(velocities, self.intervals, self.ahead, shape)
-
-    def rows(self, which: Any) -> Inputs:
-        """Some of the windows."""
-        parts = (self.velocities, self.intervals, self.ahead, self.shape)
-        return Inputs(*(part[which] for part in parts))
-
-    def change(self, network: Any) -> Any:
-        """Change of centre (target sizes) and log sides up to the query, [P, 4]."""
-        import torch
-
-        known = (self.intervals > 0).float()
-        context = [
-            torch.asinh(20 * self.velocities.flatten(1)) / 2,
-            self.intervals / 5,
-            known,
-            torch.log(self.ahead[:, None] + 0.5),
-            self.shape,
-        ]
-        output = network(torch.cat(context, 1))
-        n = VELOCITIES
-        weights = output[:, : 2 * n].reshape(-1, 2, n) * known[:, None]
-        centre = (weights[:, 0, :, None] * self.velocities[..., :2]).sum(1)
-        sides = (weights[:, 1, :, None] * self.velocities[..., 2:]).sum(1)
-        correction = _CORRECTION * known[:, :1] * output[:, 2 * n :]
-        return (torch.cat([centre, sides], 1) + correction) * self.ahead[:, None]
+    answers = answers / ONE
+    weights = answers[:, :MIXING].reshape(-1, 2 * RATES, VELOCITIES)
+    mixed = weights @ motion
+    mixed[:, :RATES, 2:] = mixed[:, RATES:, 2:]
+    turned = np.ones((len(mirror), 4))
+    turned[:, :2] = mirror
+    more = CORRECTION * answers[:, MIXING:-4].reshape(-1, RATES, 4)
+    return mixed[:, :RATES] + more * turned[:, None], OFFSET * answers[:, -4:] * turned
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch use one thread: sums in one order whatever the machine, and little is lost."""
-    import torch
+class _Following:
+    """The streaming form, with one row of the arrays above."""
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+    def __init__(self, network: Network, box: Sequence[float]) -> None:
+        self._network = network
+        self._frame: float = 0
+        self._count = 0
+        self._box = box
+        self._place = Place.of(*map(float, box))
+        self._inputs = np.zeros(INPUTS)
+        self._motion = np.zeros((VELOCITIES, 4))
+        self._rates: Any = None
+        self._offset: Any = None
+
+    def update(self, frame: int, box: Sequence[float]) -> None:
+        """Take in the box of a newer frame."""
+        place, interval = Place.of(*map(float, box)), float(frame - self._frame)
+        inputs, motion, seen_last = self._inputs, self._motion, _SEEN * VELOCITIES
+        inputs[_SEEN:seen_last] = inputs[: seen_last - _SEEN].copy()
+        motion[1:] = motion[:-1].copy()
+        inputs[:_SEEN], motion[0] = 0.0, 0.0
+        if interval > 0:
+            velocity = place.velocity(self._place, interval)
+            motion[0] = velocity
+            inputs[:_SEEN] = (*_row(velocity, interval), ONE)
+        self._count += 1
+        if self._count <= STARTS:
+            at = seen_last + _SEEN * (self._count - 1)
+            inputs[at : at + _SEEN] = inputs[:_SEEN]
+        inputs[-3:] = place.shape(float(self._count))
+        self._box, self._frame, self._place = box, frame, place
+        mirror = mirrored(motion)
+        shown = inputs * _MIRRORS[int(mirror[0]), int(mirror[1])]
+        rates, offset = _outlook(self._network(shown[None]), motion[None], mirror[None])
+        self._rates, self._offset = rates[0].tolist(), offset[0].tolist()
+
+    def predict(self, frame: int) -> Sequence[float]:
+        """The box at a frame, from the boxes so far."""
+        ahead = float(frame - self._frame)
+        if ahead <= 0 or self._rates is None:
+            return self._box
+        return self._place.moved(self._rates, self._offset, ahead)
 
 
-def new_network() -> Any:
-    """An untrained network, from torch's random state."""
-    import torch
+def read_learned(path: str | os.PathLike[str]) -> Learned:
+    """Read a trained forecaster; nothing in the file is executed.
 
-    network: Any = torch.nn.Sequential(
-        torch.nn.Linear(_CONTEXT, HIDDEN),
-        torch.nn.ReLU(),
-        torch.nn.Linear(HIDDEN, HIDDEN),
-        torch.nn.ReLU(),
-        torch.nn.Linear(HIDDEN, 2 * VELOCITIES + 4),
-    )
-    with torch.no_grad():
-        network[-1].weight.mul_(0.1)
-        network[-1].bias.zero_()
-        network[-1].bias[:3] = network[-1].bias[VELOCITIES : VELOCITIES + 3] = 1 / 3
-    return network
+    Raises:
+        LaeError: if the file is missing, damaged, or no such forecaster.
+    """
+    network = read_network(path, INPUTS, OUTPUTS)
+    sequences = network.document.get("sequences", [])
+    if not isinstance(sequences, list) or not all(isinstance(name, str) for name in sequences):
+        raise LaeError(f"{path}: not a forecaster that lae-sim train wrote: no names of sequences")
+    return Learned(network)
 
 
-def sides_and_size(boxes: Floats) -> tuple[Floats, Floats]:
-    """Width and height, at least 1 px, [..., 2], and their geometric mean, [..., 1]."""
-    sides = np.maximum(boxes[..., 2:], 1.0)
-    return sides, np.sqrt(sides[..., :1] * sides[..., 1:])
+def shipped() -> Guarded:
+    """The forecaster that comes with the package, guarded.
 
-
-def _moved(boxes: Floats, change: Floats) -> Floats:
-    """Boxes moved and resized by a change of centre (target sizes) and log sides."""
-    _, scale = sides_and_size(boxes)
-    centre = boxes[:, :2] + boxes[:, 2:] / 2 + change[:, :2] * scale
-    new = boxes[:, 2:] * np.exp(np.clip(change[:, 2:], -1.0, 1.0))
-    return np.concatenate([centre - new / 2, new], axis=1)
+    ``lae-sim train --made-up`` made its weights (README, "Forecasters"): no real motion is in them.
+    """
+    return Guarded(read_learned(SHIPPED))
 
 
 def write_learned(learned: Learned, path: str | os.PathLike[str]) -> None:
-    """Write a trained network, whole or not at all.
+    """Write a trained forecaster, whole or not at all; see :func:`.network.write_network`.
 
     Raises:
         LaeError: if the file cannot be written.
     """
-    import torch
-
-    document = {"format": FORMAT, "version": VERSION, **learned.document}
-    file = io.BytesIO()  # torch does not say that a disk is full as others do
-    torch.save({**document, "network": learned.network.state_dict()}, file)
-    with written_whole(path) as temporary:
-        temporary.write_bytes(file.getvalue())
-
-
-def read_learned(path: str | os.PathLike[str]) -> Windowed[Learned]:
-    """Read a trained network; nothing in the file is executed.
-
-    Raises:
-        LaeError: if torch is missing, or the file is no network of this format.
-    """
-    torch = import_torch()
-    try:
-        document = torch.load(path, map_location="cpu", weights_only=True)
-        if document.pop("format") != FORMAT or document.pop("version") != VERSION:
-            raise ValueError(f"not {FORMAT} version {VERSION}")
-        network = new_network()
-        network.load_state_dict(document.pop("network"))
-        if not all(parameter.isfinite().all() for parameter in network.parameters()):
-            raise ValueError("its weights are not finite")
-        names = document["sequences"]
-        if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-            raise ValueError("its sequences are no names")
-    except FileNotFoundError as error:
-        raise LaeError(f"{path}: no such file") from error
-    except Exception as error:  # torch, pickle and zipfile raise all kinds on damaged files
-        reason = re.split(r"\n|\. ", str(error))[0][:200]  # torch goes on with bad advice
-        raise LaeError(f"{path}: not a forecaster that lae-sim train wrote: {reason}") from error
-    return Windowed(Learned(network.eval(), document))
-
-
-def import_torch() -> Any:
-    """The torch module.
-
-    Raises:
-        LaeError: if it is not installed.
-    """
-    try:
-        import torch
-    except ImportError as error:
-        raise LaeError(
-            "the learned forecaster needs torch: pip install 'lae-sim[torch]'"
-        ) from error
-    return torch
+    write_network(learned.network, path)

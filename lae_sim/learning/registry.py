@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import is_dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, cast
 
@@ -26,9 +27,11 @@ forecasters:
   g-h[:g=0.95,h=0.8]      the g-h filter
   imm[:quiet=1,...]       two Kalman filters, quiet and agile: also agile, r, p0, stay
   least-squares[:n=8,...] a line through the last boxes: also forgetting, huber
-  learned:FILE.pt         a network that lae-sim train trained (extra torch)
+  learned                 a network trained on made-up motion, guarded (see guarded+NAME)
+  learned:FILE            a network that lae-sim train trained
   oracle                  the truth: the ceiling
   camera+NAME             any of these over the camera's motion (needs the frames: --root)
+  guarded+NAME            any of these, but held where it has lately done worse than hold
   package.module:factory  your own
 """
 
@@ -40,6 +43,7 @@ BUILT_IN = (
     "g-h",
     "imm",
     "least-squares",
+    "learned",
     "oracle",
 )
 
@@ -68,17 +72,26 @@ def load_forecaster(name: str, camera: Camera | None = None) -> AnyFactory:
     if needs_training(found):
         raise LaeError(
             f"{name} must be trained: lae-sim compare does so on other sequences; lae-sim train "
-            "makes a file for learned:FILE.pt; kalman:q=3,decay=0.99 takes numbers as they are"
+            "makes a file for learned:FILE; kalman:q=3,decay=0.99 takes numbers as they are"
         )
     return cast("AnyFactory", found)
 
 
 def files_named(name: str) -> list[str]:
     """The files that a name of a forecaster, a policy, ... leads to: weights, a user's module."""
-    kind, colon, value = name.split("camera+")[-1].partition(":")
-    if not colon:
-        return []
-    return [value] if kind == "learned" else [f"{kind.replace('.', '/')}.py"]
+    kind, colon, value = base_name(name).partition(":")
+    if kind == "learned":
+        from lae_sim.forecast.learned import SHIPPED
+
+        return [value if colon else str(SHIPPED)]
+    return [f"{kind.replace('.', '/')}.py"] if colon else []
+
+
+def base_name(name: str) -> str:
+    """The name of a forecaster without ``camera+`` and ``guarded+``."""
+    while name.startswith(("camera+", "guarded+")):
+        name = name.partition("+")[2]
+    return name
 
 
 def needs_training(forecaster: AnyFactory | Trainer) -> TypeGuard[Trainer]:
@@ -87,7 +100,7 @@ def needs_training(forecaster: AnyFactory | Trainer) -> TypeGuard[Trainer]:
 
 
 def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:
-    """The same, or a trainer: ``learned``, ``tuned-kalman``, or a user's own class with ``fit``.
+    """The same, or a trainer: ``trained``, ``tuned-kalman``, or a user's own class with ``fit``.
 
     Raises:
         LaeError: as :func:`load_forecaster`.
@@ -97,20 +110,24 @@ def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:
     what = f"forecaster {name!r}"
     if name.startswith("camera+"):
         return _over_camera(name, camera)
-    if name in ("learned", "tuned-kalman"):
+    if name.startswith("guarded+"):
+        return _guarded(name, camera)
+    if name in ("trained", "tuned-kalman"):
         from lae_sim.learning.trainers import KalmanTrainer, NetworkTrainer
 
-        return NetworkTrainer() if name == "learned" else KalmanTrainer()
+        return NetworkTrainer() if name == "trained" else KalmanTrainer()
     kind, colon, value = name.partition(":")
     if kind == "learned":
-        from lae_sim.forecast.learned import read_learned
+        from lae_sim.forecast.learned import read_learned, shipped
 
-        return read_learned(Path(value))
+        return read_learned(Path(value)) if colon else shipped()
     if kind in BUILT_IN:
         return _built_in(what, kind, value)
     if not colon:
-        names = ", ".join([*BUILT_IN, "kalman:q=...", "learned:FILE.pt", "camera+NAME"])
-        known = hint(name, (*BUILT_IN, "tuned-kalman", "learned"))
+        names = ", ".join(
+            [*BUILT_IN, "kalman:q=...", "learned:FILE", "camera+NAME", "guarded+NAME"]
+        )
+        known = hint(name, (*BUILT_IN, "tuned-kalman", "trained"))
         raise LaeError(f"no {what}: there are {names}, and package.module:factory{known}")
     factory: AnyFactory | Trainer = imported(what, name)
     if isinstance(factory, type) and hasattr(factory, "fit"):
@@ -156,10 +173,22 @@ def _over_camera(name: str, camera: Camera | None) -> AnyFactory | Trainer:
 
     base = load_any(name.removeprefix("camera+"), camera)
     if isinstance(base, Trainer):
-        from lae_sim.learning.trainers import CameraTrainer
+        from lae_sim.learning.trainers import WrappedTrainer
 
-        return CameraTrainer(base, camera)
+        return WrappedTrainer(base, partial(CameraCompensated, camera=camera))
     return CameraCompensated(base, camera)
+
+
+def _guarded(name: str, camera: Camera | None) -> AnyFactory | Trainer:
+    from lae_sim.forecast.guard import guarded
+    from lae_sim.learning.folds import Trainer
+
+    base = load_any(name.removeprefix("guarded+"), camera)
+    if isinstance(base, Trainer):
+        from lae_sim.learning.trainers import WrappedTrainer
+
+        return WrappedTrainer(base, guarded)
+    return guarded(base)
 
 
 def _built_in(what: str, kind: str, value: str) -> AnyFactory:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,18 +13,23 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou
 from lae_sim.errors import LaeError
-from lae_sim.forecast.base import ForecasterFactory
-from lae_sim.forecast.camera import Camera, CameraCompensated
+from lae_sim.forecast.base import AnyFactory, ForecasterFactory
 from lae_sim.forecast.kalman import PAPER
 from lae_sim.forecast.learned import (
-    Inputs,
+    CORRECTION,
+    HORIZONS,
+    INPUTS,
+    MIXING,
+    OFFSET,
+    OUTPUTS,
+    RATES,
+    VELOCITIES,
     Learned,
-    import_torch,
-    new_network,
-    one_thread,
-    sides_and_size,
+    Past,
+    mirrored,
+    rows_of,
 )
-from lae_sim.forecast.window import Window, Windowed
+from lae_sim.forecast.network import ONE, Network
 from lae_sim.learning.folds import Examples, Trainer
 
 
@@ -37,21 +44,22 @@ class NetworkTrainer:
 
     Attributes:
         steps: steps of gradient descent.
-        batch: queries of each.
+        hidden: width of the two hidden layers.
+        batch: queries of each step.
         rate: largest learning rate.
         faster: motion is made faster or slower by a random factor; the standard deviation of its
-            logarithm. It is mirrored, too, and x and y change places, since motion that is not in
-            the traces may come as well.
+            logarithm. x and y change places in half of the queries, too.
         progress: called after each step with how many more are done.
     """
 
     steps: int = 1000
+    hidden: int = 64
     batch: int = 2048
-    rate: float = 3e-3
+    rate: float = 4e-3
     faster: float = 0.3
     progress: Callable[[int], object] = lambda steps: None
 
-    def fit(self, examples: Examples, seed: int = 0) -> Windowed[Learned]:
+    def fit(self, examples: Examples, seed: int = 0) -> Learned:
         """Train on all examples; the same seed and torch give the same network on like processors.
 
         Raises:
@@ -59,22 +67,29 @@ class NetworkTrainer:
         """
         torch = import_torch()
         ahead = (examples.frame - examples.lanes.frames[examples.item]).astype(np.float64)
-        usable = (ahead > 0) & (_sized(examples.truth) | _sized(examples.boxes))
+        moved = examples.item > examples.lanes.first(examples.item)
+        usable = (ahead > 0) & moved & (_sized(examples.truth) | _sized(examples.boxes))
         if not usable.any():
             raise LaeError("there is nothing to learn from: no output answers a later frame")
-        with one_thread():
-            network = self._descend(torch, examples, np.flatnonzero(usable), ahead, seed)
+        with _one_thread(torch):
+            layers = self._descend(torch, examples, np.flatnonzero(usable), ahead, seed)
         document = {"sequences": sorted(set(examples.sequences)), "seed": seed, "steps": self.steps}
-        return Windowed(Learned(network.eval(), document))
+        return Learned(
+            Network.rounded(
+                [layer.weight.detach().numpy().T.astype(np.float64) for layer in layers],
+                [layer.bias.detach().numpy().astype(np.float64) for layer in layers],
+                document,
+            )
+        )
 
     def _descend(
         self, torch: Any, examples: Examples, usable: Ints, ahead: Floats, seed: int
-    ) -> Any:
+    ) -> list[Any]:
+        """The linear layers of the trained network."""
+        rng = np.random.default_rng(seed)
+        past = Past.of(examples.lanes)
         cumulative = np.cumsum(examples.weight[usable])
-        generator = torch.Generator().manual_seed(seed)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = new_network()
+        network = self._new(torch, seed)
         optimiser = torch.optim.AdamW(network.parameters(), lr=self.rate, weight_decay=1e-3)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimiser,
@@ -83,25 +98,128 @@ class NetworkTrainer:
             pct_start=0.1 + 1e-9,  # torch divides by zero where this is exactly one step
         )
         for _ in range(self.steps):
-            drawn = torch.rand(self.batch, generator=generator, dtype=torch.float64).numpy()
-            drawn = np.searchsorted(cumulative, drawn * cumulative[-1])
+            drawn = np.searchsorted(cumulative, rng.random(self.batch) * cumulative[-1])
             which = usable[np.minimum(drawn, len(usable) - 1)]
-            window = Window.of(examples.lanes, examples.item[which], Learned.size)
-            goal = torch.from_numpy(_goals(window.boxes[:, 0], examples, which))
-            signs = 1.0 - 2.0 * torch.randint(2, (self.batch, 2), generator=generator)
-            faster = torch.exp(self.faster * torch.randn(self.batch, 1, generator=generator))
-            flipped = torch.rand(self.batch, generator=generator) < 0.5
-            inputs = Inputs.of(window, ahead[which])
-            shown = inputs.stretched(signs * faster).flipped(flipped)
-            goal = goal * torch.cat([signs * faster, torch.ones(self.batch, 4)], 1)[:, None]
-            goal = torch.where(flipped[:, None, None], goal[..., [1, 0, 3, 2, 5, 4]], goal)
-            loss = _loss(shown.change(network), goal).mean()
+            batch = _Batch.of(examples, past, which).changed(
+                np.exp(self.faster * rng.standard_normal(self.batch)), rng.random(self.batch) < 0.5
+            )
+            change = batch.change(torch, network, ahead[which])
+            loss = _loss(torch, change, torch.from_numpy(batch.goals)).mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
             schedule.step()
             self.progress(1)
-        return network
+        return [layer for layer in network if hasattr(layer, "weight")]
+
+    def _new(self, torch: Any, seed: int) -> Any:
+        """An untrained network: a mean of the last three velocities."""
+        widths = [INPUTS, self.hidden, self.hidden, OUTPUTS]
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            torch.manual_seed(seed)
+            layers = [torch.nn.Linear(*pair) for pair in pairwise(widths)]
+            layers[-1].weight.mul_(0.1)
+            layers[-1].bias.zero_()
+            weights = layers[-1].bias[:MIXING].view(2, RATES, VELOCITIES)
+            weights[:, 0, :3] = 1 / 3  # of the rate near; the others are added to it further on
+        first, second, last = layers
+        return torch.nn.Sequential(first, torch.nn.ReLU(), second, torch.nn.ReLU(), last)
+
+
+@contextmanager
+def _one_thread(torch: Any) -> Iterator[None]:
+    """Let torch use one thread: sums in one order whatever the machine, and little is lost."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def import_torch() -> Any:
+    """The torch module.
+
+    Raises:
+        LaeError: if it is not installed.
+    """
+    try:
+        import torch
+    except ImportError as error:
+        raise LaeError("training needs torch: pip install 'lae-sim[torch]'") from error
+    return torch
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """What is known at some queries, and what came.
+
+    Attributes:
+        motion: velocities that are seen, [P, VELOCITIES + STARTS, 4].
+        interval: frames before each, [P, VELOCITIES + STARTS].
+        shape: what else is seen, [P, 3].
+        goals: truth and the tracker's later box, by changes of the centre from the latest box and
+            sides in target sizes; and the latest box's sides, float32 [P, 2, 6].
+    """
+
+    motion: Floats
+    interval: Floats
+    shape: Floats
+    goals: Any
+
+    @classmethod
+    def of(cls, examples: Examples, past: Past, which: Ints) -> _Batch:
+        item = examples.item[which]
+        window, place = past.window(item), past.place.chosen(item)
+        shape = place.shape((item - past.first[item]).astype(np.float64))
+        truth, boxes = examples.truth[which], examples.boxes[which]
+        goals = np.stack(  # where one is missing the other stands for both
+            [
+                np.where(_sized(truth)[:, None], truth, boxes),
+                np.where(_sized(boxes)[:, None], boxes, truth),
+            ],
+            axis=1,
+        )
+        centre = np.stack([place.x, place.y], axis=1)
+        sides = np.broadcast_to(np.stack([place.w, place.h], axis=1)[:, None], (len(item), 2, 2))
+        offset = goals[..., :2] + goals[..., 2:] / 2 - centre[:, None]
+        parts = np.concatenate([offset, goals[..., 2:], sides], axis=2)
+        return cls(
+            past.velocity[window],
+            past.interval[window],
+            np.stack(shape, axis=1),
+            (parts / place.size[:, None, None]).astype(np.float32),
+        )
+
+    def changed(self, faster: Floats, flipped: Bools) -> _Batch:
+        """Motion faster by factors [P], and with x and y exchanged where flipped, [P]."""
+        motion, goals, shape = self.motion.copy(), self.goals.copy(), self.shape.copy()
+        motion[..., :2] *= faster[:, None, None]
+        goals[..., :2] *= faster[:, None, None].astype(np.float32)
+        motion[flipped] = motion[flipped][..., [1, 0, 3, 2]]
+        goals[flipped] = goals[flipped][..., [1, 0, 3, 2, 5, 4]]
+        shape[flipped, 1] = ONE - shape[flipped, 1]
+        return _Batch(motion, self.interval, shape, goals)
+
+    def change(self, torch: Any, network: Any, ahead: Floats) -> Any:
+        """What the network says of each: change of centre and sides, [P, 4]."""
+        mirror = mirrored(self.motion[:, :VELOCITIES])
+        rows = rows_of(self.motion, self.interval)
+        rows[..., :2] *= mirror[:, None]
+        inputs = np.concatenate([rows.reshape(len(rows), -1), self.shape], axis=1) / ONE
+        near, mirror, motion, inputs = (
+            torch.from_numpy(each.astype(np.float32))
+            for each in (ahead, mirror, self.motion[:, :VELOCITIES], inputs)
+        )
+        answers = network(inputs)
+        mixed = answers[:, :MIXING].reshape(-1, 2 * RATES, VELOCITIES) @ motion
+        mixed = torch.cat([mixed[:, :RATES, :2], mixed[:, RATES:, 2:]], 2)
+        turned = torch.cat([mirror, torch.ones_like(mirror)], 1)
+        more = CORRECTION * answers[:, MIXING:-4].reshape(-1, RATES, 4)
+        rates = mixed + more * turned[:, None]
+        shares = torch.stack([torch.ones_like(near), *(near / (near + h) for h in HORIZONS)], 1)
+        change = (rates * shares[..., None]).sum(1) * near[:, None]
+        return change + OFFSET * answers[:, -4:] * turned
 
 
 def _sized(boxes: Floats) -> Bools:
@@ -110,31 +228,12 @@ def _sized(boxes: Floats) -> Bools:
     return sized
 
 
-def _goals(latest: Floats, examples: Examples, which: Ints) -> Any:
-    """Truth and the tracker's later box as changes from the latest one, float32 [P, 2, 4].
-
-    Where one of them is missing the other stands for both.
-    """
-    truth, boxes = examples.truth[which], examples.boxes[which]
-    truth = np.where(_sized(truth)[:, None], truth, boxes)
-    boxes = np.where(_sized(boxes)[:, None], boxes, truth)
-    goals = np.stack([truth, boxes], axis=1)
-    sides, scale = sides_and_size(latest[:, None])
-    centre = goals[..., :2] + goals[..., 2:] / 2 - latest[:, None, :2] - latest[:, None, 2:] / 2
-    logs = np.log(goals[..., 2:] / sides)
-    aspect = np.broadcast_to(np.log(sides / scale), logs.shape)
-    return np.concatenate([centre / scale, logs, aspect], axis=2).astype(np.float32)
-
-
-def _loss(change: Any, goals: Any) -> Any:
+def _loss(torch: Any, change: Any, goals: Any) -> Any:
     """1 - IoU, mean over both goals, and the distance of the centres, [P]."""
-    import torch
-
     offset = goals[..., :2] - change[:, None, :2]
-    aspect = goals[..., 4:]
-    sides = torch.exp(change[:, None, 2:].clamp(-1, 1) + aspect)  # in target sizes
-    goal_sides = torch.exp(goals[..., 2:4] + aspect)
-    shared = (torch.minimum(sides / 2, offset + goal_sides / 2)).sub(
+    ratio = change[:, None, 2:].clamp(-1, 1)
+    goal_sides, sides = goals[..., 2:4], goals[..., 4:] * (2 + ratio) / (2 - ratio)
+    shared = torch.minimum(sides / 2, offset + goal_sides / 2).sub(
         torch.maximum(-sides / 2, offset - goal_sides / 2)
     )
     overlap = shared.clamp(min=0).prod(2)
@@ -188,17 +287,17 @@ class KalmanTrainer:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraTrainer:
-    """Trains the base forecaster on boxes as they are seen, and runs it over the camera's motion.
+class WrappedTrainer:
+    """Trains a base forecaster on boxes as they are seen, and wraps it.
 
     Attributes:
-        base: trains the forecaster of the target's motion.
-        camera: the camera's motion.
+        base: trains the forecaster.
+        wrap: such as what runs it over the camera's motion, or guards it.
     """
 
     base: Trainer
-    camera: Camera
+    wrap: Callable[[AnyFactory], AnyFactory]
 
-    def fit(self, examples: Examples, seed: int) -> CameraCompensated:
+    def fit(self, examples: Examples, seed: int) -> AnyFactory:
         """The forecaster that these examples lead to."""
-        return CameraCompensated(self.base.fit(examples, seed), self.camera)
+        return self.wrap(self.base.fit(examples, seed))

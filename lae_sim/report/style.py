@@ -37,6 +37,7 @@ _FORECASTERS = {
     "imm": "#332288",
     "least-squares": VERMILION,
     "learned": "#999933",
+    "trained": "#A65628",
     "tuned-kalman": "#882255",
     "oracle": "#888888",
 }

@@ -14,7 +14,7 @@ from lae_sim.files import labels, text_digest
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import resolve_costs
 from lae_sim.learning.folds import Trainer
-from lae_sim.learning.registry import load_any, load_forecaster
+from lae_sim.learning.registry import base_name, files_named, load_any, load_forecaster
 from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import check_rate
 from lae_sim.replay.world import World, named
@@ -221,8 +221,10 @@ def _code(name: str, forecaster: AnyFactory | Trainer, training: str) -> str:
 
 def _file_code(name: str) -> str:
     """Digest of the file that a forecaster's name names, of weights or of code; or empty."""
-    kind, _, value = name.partition(":")
-    return digest(value) if kind == "learned" and value else _own_code(name)
+    name = base_name(name)
+    if name.partition(":")[0] == "learned":
+        return digest(*files_named(name))
+    return _own_code(name)
 
 
 def _own_code(name: str) -> str:
@@ -230,6 +232,6 @@ def _own_code(name: str) -> str:
 
     It must have been imported. (Of the package itself, the version says what is needed.)
     """
-    module = sys.modules.get(name.rpartition("+")[2].partition(":")[0])
+    module = sys.modules.get(name.partition(":")[0])
     path = getattr(module, "__file__", None)
     return digest(path) if path else ""

@@ -44,7 +44,7 @@ def world(tmp_path: Path) -> Path:
     (results / "car.txt").write_text(boxes)
     (tmp_path / "own.txt").write_text(boxes)
     (tmp_path / "f.csv").write_text("sequence,fps\ncar,20\n")
-    (tmp_path / "g.pt").write_bytes(b"weights")
+    (tmp_path / "g.npz").write_bytes(b"weights")
     (tmp_path / "own.py").write_text("from lae_sim import Hold\n")
     (tmp_path / "study.toml").write_text('traces = ["slow.parquet"]\n')
     shutil.copy(SLOW, tmp_path / "slow.parquet")
@@ -75,16 +75,16 @@ REPLACING = [
     "convert kcf --truth ds --time constant:47ms --truth-file car=own.txt --force"
     " --out ds/car/groundtruth_rect.txt",
     "convert kcf --truth ds --time constant:47ms --out slow.parquet",
-    "replay slow.parquet --forecaster learned:g.pt --events g.pt",
-    "replay slow.parquet --forecaster camera+learned:g.pt --root ds --events ds/../g.pt",
-    "replay slow.parquet --search c=1 --pre-forecaster learned:g.pt --timeline g.pt",
+    "replay slow.parquet --forecaster learned:g.npz --events g.npz",
+    "replay slow.parquet --forecaster camera+learned:g.npz --root ds --events ds/../g.npz",
+    "replay slow.parquet --search c=1 --pre-forecaster learned:g.npz --timeline g.npz",
     "replay slow.parquet --forecaster own:Hold --events own.py",
     "replay slow.parquet --plot hard.png",
     "replay slow.parquet --timing fast.parquet --plot link.png",
     "replay slow.parquet --strided fast.parquet --outputs fast.parquet",
     "replay slow.parquet --schedule fast.parquet",
     "replay slow.parquet --root ds --events ds/car/groundtruth_rect.txt",
-    "compare slow.parquet --forecaster learned:g.pt --out g.pt",
+    "compare slow.parquet --forecaster learned:g.npz --out g.npz",
     "compare slow.parquet --plot hard.png",
     "compare slow.parquet --root ds --plot ds/car/img/0002.png",
     "compare slow.parquet --out fast.parquet",

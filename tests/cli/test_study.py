@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from command_line import ENVIRONMENT, command, run_here, run_process
+from networks import random_learned
 from places import REPOSITORY
 from restarted import gap_pass
 
@@ -26,6 +27,7 @@ from lae_sim.cli.study import main
 from lae_sim.comparison.forecasters import score_forecasters
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate_runs
+from lae_sim.forecast.learned import write_learned
 from lae_sim.learning.trainers import KalmanTrainer
 from lae_sim.replay.latency import bootstrap, by_frame, constant, scaled
 from lae_sim.replay.world import SIGMA_GRID
@@ -581,6 +583,20 @@ def test_the_code_of_a_plug_in_is_an_input(
         assert f"{computed} of them computed" in study_command(*asked, cwd=tmp_path)
     (tmp_path / "code_of_study.py").write_text(OWN + "# changed\n")
     assert f"{changed} of them computed" in study_command(*asked, cwd=tmp_path)
+
+
+@pytest.mark.parametrize("name", ["learned", "guarded+learned:f.npz"])
+def test_the_weights_of_a_network_are_an_input(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lae_sim.forecast.learned.SHIPPED", tmp_path / "f.npz")
+    study = Study((str(FAST),), forecasters=("hold", name))
+    for seed, computed in ((0, 2), (0, 0), (1, 1)):
+        write_learned(random_learned(seed), "f.npz")
+        results = run(tmp_path / "out", study)
+        assert results.computed == computed
+        assert any(random_learned(seed).network.digest[:16] in note for note in results.notes())
 
 
 def test_what_is_trained_is_not_trained_again(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from functools import partial
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from lae_sim.errors import LaeError
 from lae_sim.forecast.base import ConstantVelocity, Hold, Lanes, forecast
 from lae_sim.forecast.camera import Camera, CameraCompensated, CameraMotion, estimate_camera
 from lae_sim.forecast.kalman import Kalman
-from lae_sim.learning.trainers import CameraTrainer
+from lae_sim.learning.trainers import WrappedTrainer
 from lae_sim.profile.live import run_real_time
 
 FPS = Fraction(30)
@@ -245,7 +246,8 @@ def test_trainers_share_what_is_known():
             return Hold
 
     sequence, asked = counted(film([similarity(4, 1)] * 2))
-    trainer = CameraTrainer(Trainer(), Camera({"film": sequence}, FPS))
+    camera = Camera({"film": sequence}, FPS)
+    trainer = WrappedTrainer(Trainer(), partial(CameraCompensated, camera=camera))
     for seed in range(2):
         trained = trainer.fit(None, seed)
         assert trained.base is Hold

@@ -13,19 +13,30 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from networks import random_learned
 from walks import lanes_and_queries, streaming
 from witness import moving
 
 from lae_sim.datasets.frames import ImageSequence
+from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
 from lae_sim.forecast.base import ConstantVelocity, Hold, Lanes, Oracle, factory_for, forecast
 from lae_sim.forecast.camera import Camera
 from lae_sim.forecast.filters import GH, IMM
+from lae_sim.forecast.guard import Guarded, guarded
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt, TunedKalman
-from lae_sim.forecast.learned import write_learned
+from lae_sim.forecast.learned import SHIPPED, Learned, read_learned, write_learned
 from lae_sim.forecast.window import LeastSquares, Windowed
-from lae_sim.learning.folds import Trainer
-from lae_sim.learning.registry import FORECASTERS, load_any, load_forecaster
+from lae_sim.learning.folds import Examples, Trainer
+from lae_sim.learning.registry import (
+    FORECASTERS,
+    base_name,
+    files_named,
+    load_any,
+    load_forecaster,
+)
+from lae_sim.learning.trainers import KalmanTrainer
+from lae_sim.replay.run import replay_sequence
 
 BUILT_IN = {
     "hold": Hold,
@@ -43,6 +54,8 @@ MADE = {
     "imm:stay=0.5,agile=9": IMM(agile=9, stay=0.5),
     "least-squares": Windowed(LeastSquares()),
     "least-squares:n=3,forgetting=1,huber=0.5": Windowed(LeastSquares(3, 1, 0.5)),
+    "guarded+kalman": Guarded(Kalman),
+    "guarded+kalman:q=3": Guarded(TunedKalman(q=3)),
 }
 
 
@@ -56,14 +69,40 @@ def test_names_with_options(name: str, factory: Any) -> None:
     assert load_forecaster(name) == factory
 
 
-def test_every_name_that_the_help_lists_is_there(learned: Any, tmp_path: Path) -> None:
-    write_learned(learned.rule, tmp_path / "FILE.pt")
+def test_what_is_learned_is_shipped_or_read_and_guarded_by_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "a+b.npz"
+    write_learned(random_learned(), path)
+    found: Any = load_forecaster("learned")
+    assert isinstance(found, Guarded)
+    assert found.base.network.digest == read_learned(SHIPPED).network.digest  # type: ignore[attr-defined]
+    alone: Any = load_forecaster(f"learned:{path}")
+    assert isinstance(alone, Learned)
+    assert alone.network.digest == random_learned().network.digest
+    over: Any = load_forecaster(f"guarded+learned:{path}")
+    assert over.base.network.digest == alone.network.digest
+    sequenced: Any = load_forecaster("guarded+oracle")
+    assert isinstance(sequenced.for_sequence(moving(9)), Guarded)
+
+
+def test_a_name_leads_to_its_files() -> None:
+    for name, files in {
+        "kalman": [], "hold": [], "guarded+kalman": [], "tuned-kalman": [], "trained": [],
+        "learned": [str(SHIPPED)], "camera+guarded+learned": [str(SHIPPED)],
+        "learned:f.npz": ["f.npz"], "guarded+camera+learned:a+b.npz": ["a+b.npz"],
+        "guarded+my.own:Mine": ["my/own.py"],
+    }.items():  # fmt: skip
+        assert files_named(name) == files, name
+    assert base_name("guarded+camera+learned:camera+f.npz") == "learned:camera+f.npz"
+
+
+def test_every_name_that_the_help_lists_is_there(tmp_path: Path) -> None:
+    write_learned(random_learned(), tmp_path / "FILE")
     names = [line.split()[0] for line in FORECASTERS.splitlines()[1:]]
     assert len(names) >= 11
     box = [10.0, 20, 30, 40]
     for listed in names:
         name = re.sub(r"\[:(.*?)(,\.\.\.)?\]", r":\1", listed)
-        name = name.replace("FILE.pt", str(tmp_path / "FILE.pt")).replace("NAME", "kalman")
+        name = name.replace("FILE", str(tmp_path / "FILE")).replace("NAME", "kalman")
         if name == "package.module:factory":
             continue
         frames = {"s": ImageSequence("s", np.array([box]), lambda i: np.zeros((9, 9, 3), np.uint8))}
@@ -91,12 +130,16 @@ def test_every_name_that_the_help_lists_is_there(learned: Any, tmp_path: Path) -
         ("hold:n=3", "'hold:n=3': hold takes no options"),
         ("oracle:x", "oracle takes no options"),
         (
-            "learned",
-            "learned must be trained: lae-sim compare does so .* lae-sim train makes a file",
+            "trained",
+            "trained must be trained: lae-sim compare does so .* lae-sim train makes a file",
         ),
         ("tuned-kalman", "tuned-kalman must be trained"),
-        ("learned:no-such-file.pt", "no-such-file.pt: no such file"),
-        ("learned:", "not a forecaster"),
+        ("guarded+trained", r"guarded\+trained must be trained"),
+        ("guarded+nothing", "no forecaster 'nothing'"),
+        ("guarded+camera+kalman", r"camera\+kalman needs the frames"),
+        ("train", "no forecaster 'train': .* did you mean 'trained'"),
+        ("learned:no-such-file.npz", "no-such-file.npz: no such file"),
+        ("learned:", "a folder, not a file"),
         ("camera+kalman", "needs the frames: give the dataset's folder with --root"),
         ("camera+nothing", "needs the frames"),
         ("kalmann", "no forecaster 'kalmann': there are hold, constant-velocity, kalman"),
@@ -109,18 +152,23 @@ def test_every_name_that_the_help_lists_is_there(learned: Any, tmp_path: Path) -
         ("lae_sim.forecast.kalman:Kalman:update", "AttributeError"),
     ],
 )
-def test_a_wrong_name_says_what_is_wrong(name: str, problem: str, request: Any) -> None:
-    if name.startswith("learned:"):
-        request.getfixturevalue("torch")
+def test_a_wrong_name_says_what_is_wrong(name: str, problem: str) -> None:
     with pytest.raises(LaeError, match=problem) as caught:
         load_forecaster(name)
     assert "\n" not in str(caught.value)
 
 
 def test_trainers_are_loaded_where_they_can_be_trained() -> None:
-    for name in ("learned", "tuned-kalman"):
+    for name in ("trained", "tuned-kalman", "guarded+trained", "guarded+tuned-kalman"):
         assert isinstance(load_any(name), Trainer)
-    assert not isinstance(load_any("kalman"), Trainer)
+    for name in ("kalman", "learned", "guarded+kalman"):
+        assert not isinstance(load_any(name), Trainer)
+    recordings = [moving(40, seed, f"s{seed}") for seed in range(2)]
+    runs = [replay_sequence(recording, Clock.at(Fraction(30))) for recording in recordings]
+    made: Any = load_any("guarded+tuned-kalman")
+    trained = made.fit(Examples.of(runs), 0)
+    assert isinstance(trained, Guarded)
+    assert trained == guarded(KalmanTrainer().fit(Examples.of(runs)))
 
 
 # ------------------------------------------------------------------------------------- a user's own
@@ -190,16 +238,15 @@ def told(forecasters: Sequence[Any], lanes: Lanes) -> list[Told]:
 @given(case=lanes_and_queries(), data=st.data())
 @settings(max_examples=6)
 def test_no_state_leaks_from_one_sequence_to_another(
-    name: str, case: Any, data: st.DataObject, request: Any
+    name: str, case: Any, data: st.DataObject
 ) -> None:
     lanes, item, frame = case
-    found = request.getfixturevalue("learned") if name == "learned" else load_forecaster(name)
+    found = load_forecaster(name)
     count = len(lanes.offsets) - 1
     sequences = [SEQUENCES[k % 3] for k in range(count)]
 
     def alone(k: int) -> Told:
-        fresh = request.getfixturevalue("learned") if name == "learned" else load_forecaster(name)
-        factory = factory_for(fresh, sequences[k])
+        factory = factory_for(load_forecaster(name), sequences[k])
         part = lanes.chosen(np.arange(count) == k, item)[0]
         return told([factory(part.boxes[0].tolist(), (640, 360))], part)[0]
 
@@ -219,6 +266,5 @@ def test_no_state_leaks_from_one_sequence_to_another(
         part, asked, places = lanes.chosen(np.arange(count) == k, item)
         assert np.flatnonzero(asked).tolist() == order.tolist()
         one = forecast(found, part, places, frame[order])
-        tolerance = 1e-3 if name == "learned" else 1e-9
         for answers in both:
-            np.testing.assert_allclose(answers[order], one, rtol=1e-9, atol=tolerance)
+            np.testing.assert_allclose(answers[order], one, rtol=1e-9, atol=1e-9)

@@ -13,7 +13,7 @@ from lae_sim.report.style import (
     tracker_styles,
 )
 
-NAMES = [*BUILT_IN, "learned", "tuned-kalman"]
+NAMES = [*BUILT_IN, "trained", "tuned-kalman"]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,0 +1,194 @@
+"""A guard: where a forecaster has lately done worse than holding the box, the box is held.
+
+With every output one can see what the forecaster had said for that frame, as of the output before,
+and how far the held box was off. Means of both errors, which forget, are kept for each coordinate:
+the centre's two, the width and the height. Hold answers in a coordinate once the forecaster's error
+is clearly above hold's, until it is below. Nothing of the truth is used, so what a tracker does
+wrong by habit, and a forecaster mends, looks like an error of the forecaster: the guard is slow to
+believe it, above all of the sides, where habits are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim.forecast.arithmetic import Number, root, within
+from lae_sim.forecast.base import (
+    AnyFactory,
+    Forecaster,
+    ForecasterFactory,
+    ImageSize,
+    Lanes,
+    Sequenced,
+    SequenceFactory,
+    defines,
+    forecast,
+    notes_of,
+)
+
+_KEPT = 0.9
+_WORSE, _BETTER = 1.25, 1.0
+# Of the errors, in target sizes, that count for nothing: of x, y, w and h.
+_SLACK = (0.002, 0.002, 0.05, 0.05)
+_MOST = 1.0  # a single error counts for no more, such as that of a jump
+_FEWEST = 2  # outputs before one can be judged: with the initial box alone every forecast is that
+
+
+def guarded(base: AnyFactory) -> AnyFactory:
+    """A factory whose forecasters are guarded."""
+    return _OfSequences(base) if isinstance(base, SequenceFactory) else Guarded(base)
+
+
+@dataclass(frozen=True)
+class _OfSequences:
+    """Guards what is made for a sequence."""
+
+    base: SequenceFactory
+
+    def for_sequence(self, sequence: Sequenced) -> ForecasterFactory:
+        return Guarded(self.base.for_sequence(sequence))
+
+    @property
+    def sees_frames(self) -> bool:
+        return bool(getattr(self.base, "sees_frames", False))
+
+    def notes(self, sequences: Sequence[str]) -> list[str]:
+        return notes_of(self.base, sequences)
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """The factory of forecasters that hold the box where forecasting has lately been worse.
+
+    Attributes:
+        base: makes the forecasters that are guarded.
+
+    Example:
+        >>> import lae_sim
+        >>> lae_sim.evaluate("traces/synthetic-slow.parquet", forecasters="guarded+kalman")
+        <EvaluationResult of synthetic-slow.parquet, recorded: AUC guarded+kalman 0.6114>
+    """
+
+    base: ForecasterFactory
+
+    @property
+    def by_number(self) -> bool:
+        """Whether the base may look things up by a frame's number (see :class:`.LaneFactory`)."""
+        return not defines(self.base, "forecast_lanes") or getattr(self.base, "by_number", False)
+
+    def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Forecaster:
+        """The forecaster of one sequence."""
+        return _Watched(self.base(box, image_size), box)
+
+    def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
+        """The same for many lanes at once, to the last bit if the base is."""
+        every = np.arange(len(lanes.frames))
+        before = np.maximum(every - 1, lanes.first(every))
+        both = np.concatenate([item, before])  # asked together, the base works once
+        order = np.argsort(both, kind="stable")
+        answers = np.empty((len(both), 4))
+        frames = np.concatenate([frame, lanes.frames])
+        answers[order] = forecast(self.base, lanes, both[order], frames[order])
+        boxes, said = answers[: len(item)], answers[len(item) :]
+        held = self._held(lanes, said, lanes.boxes[before])[item]
+        some = held.any(axis=1)
+        boxes[some] = np.stack(
+            _mixed(boxes[some].T, lanes.boxes[item[some]].T, held[some].T), axis=1
+        )
+        return boxes
+
+    @staticmethod
+    def _held(lanes: Lanes, said: Floats, latest: Floats) -> Bools:
+        """In which coordinates hold answers after each item, bool [N, 4].
+
+        Args:
+            lanes: what is known.
+            said: what the base said of each item's frame before it came, [N, 4].
+            latest: the box before, [N, 4].
+        """
+        box = lanes.boxes.T
+        errors = [np.stack(_errors(each, box)) for each in (said.T, latest.T)]
+        held = np.zeros((4, len(lanes.frames)), np.bool_)
+        sizes = np.diff(lanes.offsets)
+        order = np.argsort(-sizes, kind="stable")  # the longest first: those that end are the last
+        first, sizes = lanes.offsets[:-1][order], sizes[order]
+        state = np.zeros((4, len(order)), np.bool_)
+        own, holds = np.zeros((4, len(order))), np.zeros((4, len(order)))
+        slack = np.array(_SLACK)[:, None]
+        for k in range(_FEWEST, int(sizes[0]) if len(sizes) else 0):
+            n = int(np.searchsorted(-sizes, -k, "left"))
+            at = first[:n] + k
+            own[:, :n] = _faded(own[:, :n], errors[0][:, at])
+            holds[:, :n] = _faded(holds[:, :n], errors[1][:, at])
+            worse = own[:, :n] > _WORSE * holds[:, :n] + slack
+            still = own[:, :n] > _BETTER * holds[:, :n] + 0.5 * slack
+            state[:, :n] = np.where(state[:, :n], still, worse)
+            held[:, at] = state[:, :n]
+        return held.T
+
+    def notes(self, sequences: Sequence[str]) -> list[str]:
+        """What the base has to say."""
+        return notes_of(self.base, sequences)
+
+
+class _Watched:
+    """The streaming form."""
+
+    def __init__(self, base: Forecaster, box: Sequence[float]) -> None:
+        self._base, self._box = base, box
+        self._outputs = 0
+        self._own, self._holds = [0.0] * 4, [0.0] * 4
+        self._held = [False] * 4
+
+    def update(self, frame: int, box: Sequence[float]) -> None:
+        """Take in the box of a newer frame, and see how well it was forecast."""
+        self._outputs += 1
+        if self._outputs >= _FEWEST:
+            own = _errors(self._base.predict(frame), box)
+            holds = _errors(self._box, box)
+            self._own = [_faded(a, b) for a, b in zip(self._own, own)]
+            self._holds = [_faded(a, b) for a, b in zip(self._holds, holds)]
+            self._held = [
+                a > (_BETTER * b + 0.5 * slack if held else _WORSE * b + slack)
+                for a, b, slack, held in zip(self._own, self._holds, _SLACK, self._held)
+            ]
+        self._base.update(frame, box)
+        self._box = box
+
+    def predict(self, frame: int) -> Sequence[float]:
+        """The box at a frame."""
+        box = self._base.predict(frame)
+        return _mixed(box, self._box, self._held) if any(self._held) else box
+
+    def resize(self, image_size: ImageSize) -> None:
+        """Tell the base that images have another size."""
+        if hasattr(self._base, "resize"):
+            self._base.resize(image_size)
+
+
+def _faded(mean: Number, error: Number) -> Number:
+    return _KEPT * mean + (1.0 - _KEPT) * abs(error)
+
+
+def _errors(said: Any, box: Any) -> tuple[Number, ...]:
+    """By how much a box is off in x, y of the centre, w and h, in target sizes."""
+    (x, y, w, h), (x1, y1, w1, h1) = said, box
+    size = root(abs(w1 * h1) + 1.0)
+    off = (x + w * 0.5) - (x1 + w1 * 0.5), (y + h * 0.5) - (y1 + h1 * 0.5), w - w1, h - h1
+    return tuple(within(each / size, _MOST) for each in off)
+
+
+def _mixed(box: Any, latest: Any, held: Any) -> tuple[Any, ...]:
+    """A box with the coordinates that are held from the latest one; numbers or arrays."""
+    (x, y, w, h), (x1, y1, w1, h1) = box, latest
+    ways = zip(held, (x + w * 0.5, y + h * 0.5, w, h), (x1 + w1 * 0.5, y1 + h1 * 0.5, w1, h1))
+    x, y, w, h = (
+        np.where(keep, old, new) if isinstance(keep, np.ndarray) else (old if keep else new)
+        for keep, new, old in ways
+    )
+    return x - w * 0.5, y - h * 0.5, w, h
