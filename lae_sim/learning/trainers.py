@@ -38,9 +38,9 @@ class NetworkTrainer:
     """Trains a network by gradient descent on the overlap with what came.
 
     The loss is 1 - IoU, in part with the truth, in part with the tracker's own box of that frame
-    (Yu et al., "UnitBox", 2016, minimise -ln IoU); a small term in the distance of the centres draws
-    boxes that do not overlap. AdamW (Loshchilov and Hutter, 2019) with the one-cycle rate (Smith
-    and Topin, 2019).
+    (Yu et al., "UnitBox", 2016, minimise -ln IoU); a small term in the distance of the centres
+    draws boxes that do not overlap. AdamW (Loshchilov and Hutter, 2019) with the one-cycle rate
+    (Smith and Topin, 2019).
 
     Attributes:
         steps: steps of gradient descent.
