@@ -29,7 +29,7 @@ examples:
   lae-sim train traces/synthetic-slow.parquet --out forecaster.npz
   lae-sim train DTB70-*.parquet --latency constant:20ms constant:47ms constant:100ms --out f.npz
   lae-sim replay other.parquet --forecaster kalman learned:f.npz
-  lae-sim train --made-up 8000 --steps 12000 --seed 14 --out learned.npz     # the one that ships
+  lae-sim train --made-up 6000 --steps 10000 --seed 14 --out learned.npz     # the one that ships
 
 Scores on the sequences that it was trained on promise nothing: lae-sim compare --forecaster trained
 trains across folds, so that no sequence is scored by what has seen it.

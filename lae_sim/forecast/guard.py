@@ -32,9 +32,9 @@ from lae_sim.forecast.base import (
 )
 
 _KEPT = 0.9
-_WORSE, _BETTER = 1.25, 1.0
+_WORSE, _BETTER = 1.5, 1.1
 # Of the errors, in target sizes, that count for nothing: of x, y, w and h.
-_SLACK = (0.002, 0.002, 0.05, 0.05)
+_SLACK = (0.004, 0.004, 0.1, 0.1)
 _MOST = 1.0  # a single error counts for no more, such as that of a jump
 _FEWEST = 2  # outputs before one can be judged: with the initial box alone every forecast is that
 
