@@ -71,7 +71,7 @@ class Guarded:
     Example:
         >>> import lae_sim
         >>> lae_sim.evaluate("traces/synthetic-slow.parquet", forecasters="guarded+kalman")
-        <EvaluationResult of synthetic-slow.parquet, recorded: AUC guarded+kalman 0.6114>
+        <EvaluationResult of synthetic-slow.parquet, recorded: AUC hold 0.5722, guarded+kalman 0.6290>
     """
 
     base: ForecasterFactory
