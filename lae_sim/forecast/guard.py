@@ -70,8 +70,8 @@ class Guarded:
 
     Example:
         >>> import lae_sim
-        >>> lae_sim.evaluate("traces/synthetic-slow.parquet", forecasters="guarded+kalman")
-        <EvaluationResult of synthetic-slow.parquet, recorded: AUC hold 0.5722, guarded+kalman 0.6290>
+        >>> lae_sim.load_forecaster("guarded+kalman")
+        Guarded(base=<class 'lae_sim.forecast.kalman.Kalman'>)
     """
 
     base: ForecasterFactory
