@@ -92,18 +92,17 @@ def _train(arguments: argparse.Namespace) -> None:
     for name in ("sequence", "exclude"):
         if arguments.made_up and getattr(arguments, name):
             raise LaeError(f"--{name} goes with traces, not with --made-up")
+    paths = find_traces(arguments.traces) if arguments.traces else []
+    check_outputs(arguments, [arguments.out], paths)
     origin: dict[str, Any] = {"lae_sim": __version__}
     if arguments.made_up:
-        check_outputs(arguments, [arguments.out], [])
         count_dropped = arguments.made_up // 4
         traces = [made_up_trace(arguments.made_up, arguments.seed)]
         if count_dropped:
             traces.append(made_up_trace(count_dropped, arguments.seed, dropped=True))
         examples = Examples.of_traces(traces, [World()])
-        origin["made_up"] = arguments.made_up
+        origin |= {"made_up": arguments.made_up, "sequences": []}  # no real ones
     else:
-        paths = find_traces(arguments.traces)
-        check_outputs(arguments, [arguments.out], paths)
         traces = [read_trace(path, arguments.sequence) for path in paths]
         examples = Examples.of_traces(traces, worlds_of(arguments), arguments.exclude)
         origin |= {
@@ -111,7 +110,6 @@ def _train(arguments: argparse.Namespace) -> None:
             "latencies": arguments.latency,
             "scales": [str(scale) for scale in arguments.latency_scale],
             "policy": arguments.policy,
-            "sequences": sorted(set(examples.sequences)),
         }
     made = count(1)
     with ProgressBar("training", "steps") as bar:
@@ -119,7 +117,7 @@ def _train(arguments: argparse.Namespace) -> None:
             steps=arguments.steps, progress=lambda _: bar(next(made), arguments.steps)
         )
         learned = trainer.fit(examples, arguments.seed)
-    document = {**learned.document, "sequences": [], **origin}
+    document = {**learned.document, **origin}
     learned = Learned(replace(learned.network, document=document))
     write_learned(learned, arguments.out)
     digest = learned.network.digest

@@ -48,6 +48,14 @@ def with_arrivals(clock: Clock, arrival_ns: Ints | Sequence[int] | None) -> Cloc
     return _ArrivalClock(clock.ticks_per_ns, clock.frame_ticks, ticks)
 
 
+def same_arrivals(told: Ints | None, own: Ints | None) -> bool:
+    """Whether what another trace tells of when frames arrive agrees with one's own, ns [T].
+
+    None tells nothing, and agrees with everything; as one's own it means that frames come evenly.
+    """
+    return told is None or (own is not None and np.array_equal(told, own))
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class _ArrivalClock(Clock):
     """Answers by a table.

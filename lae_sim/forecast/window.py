@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.errors import LaeError
-from lae_sim.forecast.base import Forecaster, ImageSize, Lanes, LastOutputs, notes_of
+from lae_sim.forecast.base import Forecaster, ImageSize, Lanes, LastOutputs
 
 
 @dataclass(frozen=True)
@@ -56,18 +56,16 @@ class Rule(Protocol):
 
 _QUERIES = 16_384
 
-AnyRule = TypeVar("AnyRule", bound=Rule)
-
 
 @dataclass(frozen=True)
-class Windowed(Generic[AnyRule]):
+class Windowed:
     """The factory of forecasters that follow a rule.
 
     Attributes:
         rule: the forecast from the last outputs.
     """
 
-    rule: AnyRule
+    rule: Rule
 
     def __call__(self, box: Sequence[float], image_size: ImageSize = None) -> Forecaster:
         """The forecaster of one sequence."""
@@ -81,10 +79,6 @@ class Windowed(Generic[AnyRule]):
             some = slice(first, first + _QUERIES)
             boxes[some] = self.rule(Window.of(lanes, item[some], self.rule.size), ahead[some])
         return boxes
-
-    def notes(self, sequences: Sequence[str]) -> list[str]:
-        """What the rule has to say."""
-        return notes_of(self.rule, sequences)
 
 
 _ROUNDS = 4

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.decoding import Budget, TooLargeError
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, one_line
 
 if TYPE_CHECKING:
     import h5py
@@ -51,7 +51,7 @@ def load_hdf5(path: Path) -> dict[str, Any]:
     except (TooLargeError, MemoryError):
         raise
     except Exception as error:  # a damaged file can raise anything
-        text = " ".join(str(error).split())[:200]
+        text = one_line(str(error))[:200]
         raise LaeError(f"{path}: not a readable MATLAB file: {text}") from error
 
 

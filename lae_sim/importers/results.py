@@ -21,7 +21,7 @@ from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.foreign import Foreign, foreign, foreign_columns, foreign_file, recognised
 from lae_sim.datasets.numbers import read_lines, read_numbers
 from lae_sim.decoding import Budget
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, one_line
 from lae_sim.files import check_regular
 from lae_sim.importers.matlab import load_matlab
 from lae_sim.importers.otb import load_json, read_run
@@ -271,7 +271,7 @@ def _npz_boxes(path: Path, name: str) -> Floats:
     except (LaeError, MemoryError):
         raise
     except Exception as error:  # a damaged file can raise anything
-        text = " ".join(str(error).split())[:200]  # NumPy quotes the whole head
+        text = one_line(str(error))[:200]  # NumPy quotes the whole head
         raise LaeError(f"{path}: array {name[:80]!r} cannot be read: {text}") from error
     return _checked_boxes(boxes, f"{path}, array {name!r}")
 

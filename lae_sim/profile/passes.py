@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim.datasets.frames import Buffered, Dataset, ImageSequence
+from lae_sim.engine.arrivals import same_arrivals
 from lae_sim.engine.clock import Clock, parse_duration, split_init
 from lae_sim.engine.scheduler import Service
 from lae_sim.errors import LaeError, TraceError
@@ -128,8 +129,7 @@ def parse_timing(text: str) -> tuple[str, Timing]:
                 f"{path}: has {len(recording)} frames of sequence {sequence.name!r}, which has "
                 f"{len(sequence)} here"
             )
-        theirs, own = recording.arrival_ns, sequence.arrival_ns  # none says nothing of it
-        if theirs is not None and (own is None or not np.array_equal(theirs, own)):
+        if not same_arrivals(recording.arrival_ns, sequence.arrival_ns):
             raise LaeError(
                 f"{path}: the frames of sequence {sequence.name!r} arrived at other times than "
                 "they do here (--frame-times)"

@@ -11,7 +11,7 @@ import numpy as np
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.boxes import PARTED_IOU, iou
-from lae_sim.engine.arrivals import with_arrivals
+from lae_sim.engine.arrivals import same_arrivals, with_arrivals
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.lanes import simulate_lanes
 from lae_sim.engine.policies import latest
@@ -143,8 +143,7 @@ class _Job:
                     f"sequence {self.recording.name!r} has {len(self.recording)} frames in one "
                     f"trace and {len(other)} in another"
                 )
-            theirs, own = other.arrival_ns, self.recording.arrival_ns  # none says nothing of it
-            if theirs is not None and (own is None or not np.array_equal(theirs, own)):
+            if not same_arrivals(other.arrival_ns, self.recording.arrival_ns):
                 raise LaeError(
                     f"sequence {self.recording.name!r}: its frames arrived at other times in one "
                     "trace than in another: --forget-arrivals (forget_arrivals) spaces them evenly"

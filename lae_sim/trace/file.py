@@ -410,11 +410,7 @@ class _StoredRecordings:
             raise TraceError(
                 f"{self.path}: column 'sequence' is missing: is this a lae_sim trace?"
             ) from error
-        except (
-            pa.ArrowException,
-            OSError,
-            ValueError,
-        ) as error:  # no memory is not the file's fault
+        except (pa.ArrowException, OSError, ValueError) as error:  # not for want of memory
             if not is_url(self.path) and not os.path.lexists(self.path):
                 raise TraceError(f"{self.path}: no such file") from error  # constant:47ms, too
             raise TraceError(f"{self.path}: not a readable Parquet file: {error}") from error

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lae_sim.errors import LaeError, TraceError
+from lae_sim.errors import LaeError, TraceError, one_line
 from lae_sim.files import check_regular
 
 BLOCK = 8 << 20  # bytes read at once; s3fs would take 50 MiB, several times over
@@ -168,4 +168,4 @@ def _explained(path: str) -> Iterator[None]:
 
 
 def _line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+    return f"{type(error).__name__}: {one_line(str(error))[:300]}"
