@@ -158,7 +158,7 @@ class ComparisonResult:
 
     def plot(self) -> Figure:
         """The mean of each forecaster with its interval, and the share recovered beside it."""
-        from lae_sim.report.forecaster_figures import overview
+        from lae_sim.figures.forecasters import overview
 
         return overview(self.summary, self.metrics[0])
 
@@ -168,7 +168,8 @@ class ComparisonResult:
         return "\n\n".join([comparison_table(self.summary), *self.notes])
 
     def __repr__(self) -> str:
-        from lae_sim.report.table import FINE_SCORE, METRIC_LABELS
+        from lae_sim.figures.labels import METRIC_LABELS
+        from lae_sim.report.table import FINE_SCORE
 
         table = self.summary[self.summary["metric"] == self.metrics[0]]
         first = table.drop_duplicates("forecaster")

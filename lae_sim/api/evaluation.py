@@ -504,7 +504,7 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
         sigma: the permitted latency of a sweep's scores; the first by default. Success and
             precision are at the first in any case.
     """
-    from lae_sim.report import figures
+    from lae_sim.figures import replay as figures
     from lae_sim.report.export import sigma_text
 
     first = parts[0].scenario

@@ -14,9 +14,9 @@ from lae_sim.progress import ProgressBar
 from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
 from lae_sim.report.study_tables import write_tables
-from lae_sim.report.study_view import View
 from lae_sim.study.run import StudyResults, check_inputs, compute_study
 from lae_sim.study.spec import Study, read_study
+from lae_sim.study.view import View
 
 
 def run_study(

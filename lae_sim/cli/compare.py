@@ -132,7 +132,7 @@ def _compare(arguments: argparse.Namespace) -> None:
     if arguments.attributes:
         tables["attributes"] = result.attributes
     if arguments.plot:
-        from lae_sim.report.style import save
+        from lae_sim.figures.style import save
 
         save(result.plot(), arguments.plot)
     if arguments.sigma_grid:
@@ -169,7 +169,7 @@ def _check_files(arguments: argparse.Namespace, traces: Sequence[str]) -> None:
     if arguments.out and Path(arguments.out).suffix not in (".csv", ".parquet"):
         raise LaeError(f"--out {arguments.out}: name a .csv or .parquet file")
     if arguments.plot:
-        from lae_sim.report.style import check_format
+        from lae_sim.figures.style import check_format
 
         check_format(arguments.plot)
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import add_world, check_outputs, exit_status, new_parser, worlds_of
 from lae_sim.errors import LaeError
+from lae_sim.figures.film import Scene
 from lae_sim.files import file_names
 from lae_sim.learning.registry import load_forecaster
-from lae_sim.report.film import Scene
 
 if TYPE_CHECKING:
     from lae_sim.datasets.frames import ImageSequence

@@ -161,7 +161,7 @@ def _replay(arguments: argparse.Namespace) -> None:
         camera_lag=arguments.camera_lag,
     )
     if arguments.plot:
-        from lae_sim.report.style import check_format
+        from lae_sim.figures.style import check_format
 
         check_format(arguments.plot)
     observed = list(product(arguments.forecaster, arguments.sigma))
@@ -178,7 +178,7 @@ def _replay(arguments: argparse.Namespace) -> None:
             for scenario in asked
         )
         if arguments.plot:
-            from lae_sim.report.style import save
+            from lae_sim.figures.style import save
 
             save(plot_evaluations(scored, arguments.sigma[0]), arguments.plot)
     result = EvaluationResult(scored)

@@ -15,8 +15,8 @@ from lae_sim.comparison.fidelity import (
     FidelitySummary,
 )
 from lae_sim.comparison.statistics import KEYS
+from lae_sim.figures.labels import METRIC_LABELS, setting_label
 from lae_sim.report.table import (
-    METRIC_LABELS,
     PERCENT,
     SCORE,
     SIGNED,
@@ -26,7 +26,6 @@ from lae_sim.report.table import (
     ends_text,
     is_unknown,
     p_label,
-    setting_label,
     text_of,
 )
 

@@ -1,6 +1,6 @@
 """The tables of a study: for its page, as CSV and LaTeX for a paper, and as text for a terminal.
 
-Tables for a paper show the settings that stand for all (see :mod:`lae_sim.report.study_view`), and
+Tables for a paper show the settings that stand for all (see :mod:`lae_sim.study.view`), and
 those for a terminal fewer columns.
 """
 
@@ -20,15 +20,6 @@ from typing import TYPE_CHECKING, Any
 from lae_sim.comparison.statistics import ALL_TRACES
 from lae_sim.errors import visible
 from lae_sim.files import written_whole
-from lae_sim.report.study_view import (
-    SETTINGS,
-    View,
-    run_of,
-    score_name,
-    setting_of,
-    several,
-    shared_setting,
-)
 from lae_sim.report.table import (
     CHANGE,
     PERCENT,
@@ -46,6 +37,15 @@ from lae_sim.report.table import (
     write_csv,
 )
 from lae_sim.study.records import Comparison, Requirement, SummaryRow
+from lae_sim.study.view import (
+    SETTINGS,
+    View,
+    run_of,
+    score_name,
+    setting_of,
+    several,
+    shared_setting,
+)
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults

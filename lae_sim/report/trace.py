@@ -13,7 +13,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.errors import visible
-from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
+from lae_sim.figures.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
 from lae_sim.report.table import COUNT, Column, Number, Table, text_of
 from lae_sim.trace.describe import InitCost, Report, gathered
 

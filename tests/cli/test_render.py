@@ -20,9 +20,9 @@ from lae_sim.datasets.frames import ImageSequence
 from lae_sim.datasets.synthetic import synthetic_dataset
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
+from lae_sim.figures.film import Scene, colours_of
 from lae_sim.forecast.base import Hold
 from lae_sim.replay.run import replay_sequence
-from lae_sim.report.film import Scene, colours_of
 from lae_sim.trace.file import Trace, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording

@@ -9,8 +9,8 @@ from fractions import Fraction
 import pytest
 from nasty import nasty_traces
 
+from lae_sim.figures.study import Point, _front, _gains, front
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.report.study_figures import Point, _front, _gains, front
 from lae_sim.report.study_tables import (
     comparison_table,
     ranking,
@@ -19,11 +19,11 @@ from lae_sim.report.study_tables import (
     table2,
     write_tables,
 )
-from lae_sim.report.study_view import View, run_of, setting_of
 from lae_sim.report.table import Cell, Column, Table, latex_of, tex
 from lae_sim.study.records import MEAN
 from lae_sim.study.run import StudyResults, compute_study, flat_rows
 from lae_sim.study.spec import Study
+from lae_sim.study.view import View, run_of, setting_of
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,7 @@ from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS
 from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.evaluation.totals import CurveTotals
-from lae_sim.replay.run import Run
-from lae_sim.report.replay import Report
-from lae_sim.report.style import (
+from lae_sim.figures.style import (
     BLUE,
     GREY,
     SKY_BLUE,
@@ -32,11 +30,15 @@ from lae_sim.report.style import (
     styled,
     tracker_styles,
 )
+from lae_sim.replay.run import Run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+
+Report = dict[str, Any]
+"""What a replay says of a trace (see :func:`lae_sim.report.replay.trace_report`)."""
 
 Curves = dict[str, tuple[Floats, Floats]]
 """By name: success over IoU thresholds, and precision over 0..50 px, mean over sequences."""

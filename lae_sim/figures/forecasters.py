@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from lae_sim.comparison.statistics import ALL_TRACES
-from lae_sim.report.figures import Line, Panel, draw_sweep
-from lae_sim.report.style import (
+from lae_sim.figures.labels import METRIC_LABELS, setting_label
+from lae_sim.figures.replay import Line, Panel, draw_sweep
+from lae_sim.figures.style import (
     Style,
     forecaster_styles,
     legend_below,
@@ -17,7 +18,6 @@ from lae_sim.report.style import (
     panel_grid,
     styled,
 )
-from lae_sim.report.table import METRIC_LABELS, setting_label
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,10 +16,8 @@ import numpy as np
 from lae_sim.comparison.statistics import ALL_TRACES, Interval
 from lae_sim.engine.clock import parse_duration, split_init
 from lae_sim.errors import visible
-from lae_sim.replay.search import ReachRange, parse_search
-from lae_sim.report.figures import Curve, Line, Panel, draw_curves, draw_sweep
-from lae_sim.report.study_view import SETTINGS, View, run_of, score_name, setting_of, shared_setting
-from lae_sim.report.style import (
+from lae_sim.figures.replay import Curve, Line, Panel, draw_curves, draw_sweep
+from lae_sim.figures.style import (
     BLUE,
     GREY,
     VERMILION,
@@ -33,8 +31,10 @@ from lae_sim.report.style import (
     svg_of,
     tracker_styles,
 )
+from lae_sim.replay.search import ReachRange, parse_search
 from lae_sim.study.records import SummaryRow
 from lae_sim.study.summary import Scores
+from lae_sim.study.view import SETTINGS, View, run_of, score_name, setting_of, shared_setting
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -341,7 +341,7 @@ def _dot(
 
 def attributes(view: View) -> Iterator[Picture]:
     """Gains on the sequences of each attribute, all trackers of a dataset together."""
-    from lae_sim.report.forecaster_figures import attribute_bars
+    from lae_sim.figures.forecasters import attribute_bars
 
     if view.attributes is None:
         return

@@ -14,7 +14,7 @@ from lae_sim._arrays import Floats
 from lae_sim.boxes import iou
 from lae_sim.datasets.frames import Image
 from lae_sim.errors import LaeError
-from lae_sim.report.style import forecaster_colours
+from lae_sim.figures.style import forecaster_colours
 
 if TYPE_CHECKING:
     from lae_sim.datasets.frames import ImageSequence
@@ -193,7 +193,7 @@ class Scene:
         return cls(run, images, found)
 
     def draw(self, frame: int, width: int | None = None) -> Image:
-        """Draw the boxes for a world frame on it; see `lae_sim.report.film.draw_frame`.
+        """Draw the boxes for a world frame on it; see `lae_sim.figures.film.draw_frame`.
 
         Raises:
             LaeError: if there is no such frame, or it cannot be read.
