@@ -1,6 +1,6 @@
 from .film import Scene, draw_frame, film_strip
+from .lines import draw_curves
 from .replay import (
-    draw_curves,
     fidelity_figure,
     success_and_precision,
     sweep_figure,

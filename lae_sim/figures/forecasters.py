@@ -9,7 +9,7 @@ import numpy as np
 
 from lae_sim.comparison.statistics import ALL_TRACES
 from lae_sim.figures.labels import METRIC_LABELS, setting_label
-from lae_sim.figures.replay import Line, Panel, draw_sweep
+from lae_sim.figures.lines import Line, Panel, draw_sweep
 from lae_sim.figures.style import (
     Style,
     forecaster_styles,

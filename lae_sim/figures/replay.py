@@ -3,30 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lae_sim._arrays import Floats
 from lae_sim.comparison.fidelity import FidelityRow
 from lae_sim.evaluation.evaluate import Evaluation
-from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS
 from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.evaluation.totals import CurveTotals
+from lae_sim.figures.lines import Curve, Line, Panel, draw_curves, draw_sweep
 from lae_sim.figures.style import (
     BLUE,
     GREY,
     SKY_BLUE,
     VERMILION,
-    Style,
     forecaster_lines,
     forecaster_styles,
-    legend_below,
     new_figure,
-    panel_grid,
     styled,
     tracker_styles,
 )
@@ -60,40 +55,6 @@ def mean_curves(scored: Evaluation | CurveTotals, forecasters: Iterable[str]) ->
     return {name: (mean.success, mean.precision) for name, mean in means.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A line of success and precision plots.
-
-    Attributes:
-        label: in the legend, which adds AUC and DP at 20 px.
-        success: over the IoU thresholds, float64 [N].
-        precision: over 0, 1, ..., 50 px, float64 [51].
-        style: of the line.
-    """
-
-    label: str
-    success: Floats
-    precision: Floats
-    style: Style
-
-
-@styled
-def draw_curves(curves: Sequence[Curve], title: str = "") -> Figure:
-    """Success and precision plots side by side."""
-    figure = new_figure(10, 4.2 + 0.1 * len(curves))
-    left, right = figure.subplots(1, 2)
-    figure.suptitle(title)
-    for curve in curves:
-        style = {**curve.style, "marker": ""}
-        label = f"{curve.label} [{curve.success.mean():.3f}, {curve.precision[20]:.3f}]"
-        left.plot(np.linspace(0, 1, len(curve.success)), curve.success, label=label, **style)
-        right.plot(CENTRE_THRESHOLDS, curve.precision, label=label, **style)
-    left.set(xlabel="overlap threshold", ylabel="success", xlim=(0, 1), ylim=(0, 1))
-    right.set(xlabel="centre error threshold (px)", ylabel="precision", xlim=(0, 50), ylim=(0, 1))
-    legend_below(figure)
-    return figure
-
-
 def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Figure:
     """Success and precision plots side by side, AUC and DP at 20 px in the legend.
 
@@ -119,78 +80,6 @@ def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str
         title,
     )
 
-
-@dataclass(frozen=True, eq=False)
-class Line:
-    """A line of a sweep.
-
-    Attributes:
-        label: in the legend.
-        x, y: its points, [n].
-        style: of the line; its markers are left out where there are many points.
-        band: around it, lowest and highest y, [n] each.
-    """
-
-    label: str
-    x: npt.ArrayLike
-    y: npt.ArrayLike
-    style: Style
-    band: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """A panel of a sweep.
-
-    Attributes:
-        title, xlabel, ylabel: what it shows.
-        lines: on it.
-        logarithmic: whether the horizontal axis is, to the base of 2.
-    """
-
-    title: str
-    xlabel: str
-    ylabel: str
-    lines: Sequence[Line]
-    logarithmic: bool = False
-
-
-@styled
-def draw_sweep(
-    panels: Sequence[Panel], columns: int, title: str = "", names: Sequence[str] = (), **shared: Any
-) -> Figure:
-    """Lines over what was varied, a legend for all panels below them.
-
-    Args:
-        panels: row by row.
-        columns: panels in a row.
-        title: above all.
-        names: labels in the order of the legend; by default in that of the lines.
-        shared: which axes panels share, as for Matplotlib's ``subplots``.
-    """
-    figure, grid = panel_grid(len(panels), columns, 10 / min(columns, 3), 3, **shared)
-    figure.suptitle(title)
-    for place, (axes, panel) in enumerate(zip(grid, panels)):
-        for line in panel.lines:
-            style = {**line.style, "marker": ""} if np.size(line.x) > MOST_MARKERS else line.style
-            axes.plot(line.x, line.y, label=line.label, **style)
-            if line.band is not None:
-                colour = line.style["color"]
-                axes.fill_between(line.x, *line.band, color=colour, alpha=0.12, linewidth=0)
-        axes.set(title=panel.title, ylabel=panel.ylabel)
-        if not shared.get("sharex") or place + columns >= len(panels):
-            axes.set_xlabel(panel.xlabel)
-        if panel.logarithmic:
-            axes.set_xscale("log", base=2)
-        xs = np.unique(np.concatenate([np.ravel(line.x) for line in panel.lines]))
-        if len(xs) <= MOST_TICKS:
-            axes.set_xticks(xs, [f"{x:g}" for x in xs], minor=False)
-    legend_below(figure, names)
-    return figure
-
-
-MOST_MARKERS, MOST_TICKS = 12, 8
-"""More points have no markers, and not each a tick."""
 
 _AXES = {"fps": "world frame rate (fps)", "latency_scale": "scale of the processing times"}
 _SCORES = {"auc": "AUC", "dp20": "DP at 20 px"}

@@ -16,7 +16,7 @@ import numpy as np
 from lae_sim.comparison.statistics import ALL_TRACES, Interval
 from lae_sim.engine.clock import parse_duration, split_init
 from lae_sim.errors import visible
-from lae_sim.figures.replay import Curve, Line, Panel, draw_curves, draw_sweep
+from lae_sim.figures.lines import Curve, Line, Panel, draw_curves, draw_sweep
 from lae_sim.figures.style import (
     BLUE,
     GREY,
