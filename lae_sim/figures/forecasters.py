@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from lae_sim.comparison.statistics import ALL_TRACES
+from lae_sim.figures.column import ColumnFigure, column_figure
 from lae_sim.figures.labels import METRIC_LABELS, setting_label
-from lae_sim.figures.lines import Line, Panel, draw_sweep
+from lae_sim.figures.lines import Line, Panel, draw_sweep, panel_in_column
 from lae_sim.figures.style import (
     Style,
     forecaster_styles,
@@ -26,8 +28,9 @@ if TYPE_CHECKING:
 
 _MOST_TRACES = 6
 _RECOVERED_LIMITS = (-100, 150)  # where little was lost, an interval knows no bounds
-_SLANTED = {"rotation": 25, "ha": "right", "rotation_mode": "anchor"}
+_SLANTED: Any = {"rotation": 25, "ha": "right", "rotation_mode": "anchor"}
 _SHARE_LABEL = "latency loss recovered (%)"
+_HATCHES = ("", "////", "....", "xxxx", "----")  # bars that differ in grey print
 
 
 @styled
@@ -37,47 +40,126 @@ def overview(summary: pd.DataFrame, metric: str = "auc") -> Figure:
     A row of panels for each trace, or for all traces together if there are more than six; at the
     smallest permitted latency of the summary. An interval that is not known is not drawn.
     """
-    chosen = _few_traces(summary[summary["metric"] == metric])
-    chosen = chosen[chosen["sigma"] == chosen["sigma"].min()]
+    chosen = _at_least_sigma(summary, metric)
     traces, styles = chosen["trace"].unique(), _styles(chosen)
-    settings = [setting_label(*pair) for pair in zip(chosen["latency"], chosen["scale"])]
-    chosen = chosen.assign(setting=settings)
-    settings = list(dict.fromkeys(settings))
+    settings = list(dict.fromkeys(chosen["setting"]))
     figure = new_figure(11, 1.2 + 2.6 * len(traces))
     rows = figure.subplots(len(traces), 2, squeeze=False, sharex=True, sharey="col")
-    places = np.arange(len(settings))
-    answering = [name for name in styles if name != "offline"]
-    forecasting = [name for name in answering if name != "hold"]
     for (left, right), trace in zip(rows, traces):
         of_trace = chosen[chosen["trace"] == trace]
-        for name, style in styles.items():
-            one = of_trace[of_trace["forecaster"] == name].set_index("setting").reindex(settings)
-            if name == "offline":
-                known = one["mean"].notna().to_numpy()
-                ends = places[known] - 0.42, places[known] + 0.42
-                left.hlines(one["mean"][known], *ends, label=name, **style)
-                continue
-            _dots(left, places + _offset(answering, name), one, "mean", 1, name, style)
-            if name in forecasting:
-                _dots(
-                    right, places + _offset(forecasting, name), one, "recovered", 100, name, style
-                )
-        right.axhline(0, color="0.4", linewidth=0.8)
-        if of_trace["recovered"].isna().all():
-            right.text(
-                0.5, 0.5, "not known: no offline scores", transform=right.transAxes, ha="center"
-            )
-        left.set(ylabel=_label(metric), title=trace)
-        right.set(ylabel=_SHARE_LABEL, title=trace)
-        for axes in (left, right):
-            axes.set_xticks(places, settings, **(_SLANTED if len(settings) > 4 else {}))
-            axes.set_xlim(-0.5, len(settings) - 0.5)
-            axes.grid(visible=False, axis="x")
-            for edge in range(1, len(settings)):
-                axes.axvline(edge - 0.5, color="0.85", linewidth=0.8)
+        _draw_means(left, of_trace, settings, styles, _label(metric))
+        _draw_shares(right, of_trace, settings, styles)
+        left.set_title(trace)
+        right.set_title(trace)
     _within_limits(rows[0, 1].set_ylim, rows[0, 1].get_ylim())
     legend_below(figure, list(styles))
     return figure
+
+
+def _at_least_sigma(summary: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """The rows of a metric at the smallest permitted latency, with a column ``setting``."""
+    chosen = _few_traces(summary[summary["metric"] == metric])
+    chosen = chosen[chosen["sigma"] == chosen["sigma"].min()]
+    settings = [setting_label(*pair) for pair in zip(chosen["latency"], chosen["scale"])]
+    return chosen.assign(setting=settings)
+
+
+def _draw_means(
+    axes: Axes,
+    rows: pd.DataFrame,
+    settings: Sequence[str],
+    styles: Mapping[str, Style],
+    ylabel: str,
+) -> None:
+    """The mean of each forecaster with its interval, setting by setting."""
+    places = np.arange(len(settings))
+    answering = [name for name in styles if name != "offline"]
+    for name, style in styles.items():
+        one = rows[rows["forecaster"] == name].set_index("setting").reindex(settings)
+        if name == "offline":
+            known = one["mean"].notna().to_numpy()
+            ends = places[known] - 0.42, places[known] + 0.42
+            axes.hlines(one["mean"][known], *ends, label=name, **style)
+        else:
+            _dots(axes, places + _offset(answering, name), one, "mean", 1, name, style)
+    _name_settings(axes, settings)
+    axes.set_ylabel(ylabel)
+
+
+def _draw_shares(
+    axes: Axes, rows: pd.DataFrame, settings: Sequence[str], styles: Mapping[str, Style]
+) -> None:
+    """The share of the loss that each forecaster recovers, setting by setting."""
+    places = np.arange(len(settings))
+    forecasting = [name for name in styles if name not in ("hold", "offline")]
+    for name in forecasting:
+        one = rows[rows["forecaster"] == name].set_index("setting").reindex(settings)
+        at = places + _offset(forecasting, name)
+        _dots(axes, at, one, "recovered", 100, name, styles[name])
+    axes.axhline(0, color="0.4", linewidth=0.8)
+    if rows["recovered"].isna().all():
+        axes.text(0.5, 0.5, "not known: no offline scores", transform=axes.transAxes, ha="center")
+    _name_settings(axes, settings)
+    axes.set_ylabel(_SHARE_LABEL)
+
+
+def _name_settings(axes: Axes, settings: Sequence[str]) -> None:
+    """A tick for each setting, and lines between them."""
+    slanted = len(settings) > 4 or sum(map(len, settings)) > 70
+    axes.set_xticks(range(len(settings)), settings, **(_SLANTED if slanted else {}))
+    axes.set_xlim(-0.5, len(settings) - 0.5)
+    axes.grid(visible=False, axis="x")
+    for edge in range(1, len(settings)):
+        axes.axvline(edge - 0.5, color="0.85", linewidth=0.8)
+
+
+def comparison_in_columns(
+    summary: pd.DataFrame, metrics: Sequence[str], attributes: pd.DataFrame | None = None
+) -> Iterator[ColumnFigure]:
+    """The figures of a comparison for a paper.
+
+    The mean and the share recovered of each forecaster, by trace; over scale and permitted latency,
+    where there are several; and by attribute.
+
+    Args:
+        summary: what :func:`.statistics.summarise` gave.
+        metrics: those drawn, the first also as share recovered and by attribute.
+        attributes: what :func:`.statistics.by_attribute` gave.
+    """
+    for metric in metrics:
+        chosen = _at_least_sigma(summary, metric)
+        styles, settings = _styles(chosen), list(dict.fromkeys(chosen["setting"]))
+        for trace, rows in chosen.groupby("trace", sort=False):
+            draw = partial(_draw_means, settings=settings, styles=styles, ylabel=_label(metric))
+            yield ColumnFigure(
+                f"{metric}-{trace}",
+                f"{_label(metric)} of forecasters on {trace}, with 95 % intervals over sequences",
+                column_figure(partial(draw, rows=rows)),
+            )
+            if metric == metrics[0] and rows["recovered"].notna().any():
+                yield ColumnFigure(
+                    f"recovered-{metric}-{trace}",
+                    f"Share of the {_label(metric)} lost to latency that forecasters recover on "
+                    f"{trace}, with 95 % intervals over sequences",
+                    column_figure(partial(_draw_all_shares, rows, settings, styles)),
+                )
+        for x in ("scale", "sigma"):
+            if summary[x].nunique() > 1:
+                for panel in _panels(summary, x, metric, "mean"):
+                    yield ColumnFigure(
+                        f"{metric}-over-{x}-{panel.title}",
+                        f"{_label(metric)} over the {panel.xlabel}: {panel.title}",
+                        panel_in_column(panel),
+                    )
+    if attributes is not None:
+        yield from attributes_in_columns(attributes, metrics[0])
+
+
+def _draw_all_shares(
+    rows: pd.DataFrame, settings: Sequence[str], styles: Mapping[str, Style], axes: Axes
+) -> None:
+    _draw_shares(axes, rows, settings, styles)
+    _within_limits(axes.set_ylim, axes.get_ylim())
 
 
 def against(
@@ -97,6 +179,17 @@ def against(
             no band: how far sequences differ says little of how far forecasters do.)
     """
     chosen = _few_traces(summary[summary["metric"] == metric])
+    return draw_sweep(_panels(summary, x, metric, value), 3, names=list(_styles(chosen)))
+
+
+def _panels(
+    summary: pd.DataFrame,
+    x: Literal["scale", "sigma"],
+    metric: str,
+    value: Literal["mean", "vs_hold"],
+) -> list[Panel]:
+    """A panel for each trace and setting but for x."""
+    chosen = _few_traces(summary[summary["metric"] == metric])
     if value == "vs_hold":
         chosen = chosen[chosen["forecaster"] != "offline"]
     styles = _styles(chosen)
@@ -114,7 +207,7 @@ def against(
             band = (one["vs_hold_low"], one["vs_hold_high"]) if value == "vs_hold" else None
             lines.append(Line(name, one[x], one[value], style, band))
         panels.append(Panel(title, xlabel, ylabel, lines, x == "scale" and group[x].min() > 0))
-    return draw_sweep(panels, 3, names=list(styles))
+    return panels
 
 
 @styled
@@ -130,46 +223,112 @@ def attribute_bars(
         value: the share of the latency loss recovered, or the mean of the metric, where marks show
             the offline mean.
     """
-    chosen = summary[summary["metric"] == metric]
-    if (chosen["trace"] == ALL_TRACES).any():
-        chosen = chosen[chosen["trace"] == ALL_TRACES]
-    styles = _styles(chosen)
-    rivals = [n for n in styles if n != "offline" and (n != "hold" or value == "mean")]
-    counts = chosen.groupby("attribute", sort=False)["sequences"].max()
-    groups = list(chosen.groupby(["trace", "latency", "scale", "sigma"], sort=False))
-    places, factor = np.arange(len(counts)), 100 if value == "recovered" else 1
-    height = 1.2 + len(counts) * max(0.35, 0.1 * len(rivals))
+    chosen, groups = _attribute_groups(summary, metric)
+    styles, attributes = _styles(chosen), _attribute_counts(chosen)
+    height = 1.2 + len(attributes) * max(0.35, 0.1 * len(styles))
     figure, panels = panel_grid(len(groups), 4, 4, height, sharex=True, sharey=True)
-    for axes, ((trace, latency, scale, sigma), group) in zip(panels, groups):
-        title = f"{trace}, {setting_label(latency, scale)}"
-        axes.set_title(title + (f", σ = {sigma:g}" if sigma else ""))  # noqa: RUF001
-        for name in styles if value == "mean" else rivals:
-            one = group[group["forecaster"] == name].set_index("attribute").reindex(counts.index)
-            known = one[value].notna().to_numpy()
-            one, at = one[known], places[known]
-            middle = factor * one[value]
-            if name == "offline":
-                axes.plot(middle, at, "|", color="black", markersize=14, label=name)
-                continue
-            axes.barh(
-                at + _offset(rivals, name),
-                middle,
-                0.8 / len(rivals),
-                color=styles[name]["color"],
-                label=name,
-                xerr=_errors(one, value, factor),
-                error_kw={"elinewidth": 0.8},
-            )
-        axes.set(
-            xlabel=_SHARE_LABEL if factor == 100 else _label(metric), ylim=(places[-1] + 0.5, -0.5)
-        )
-        axes.axvline(0, color="0.4", linewidth=0.8)
-        axes.set_yticks(places, [f"{name} (n = {count})" for name, count in counts.items()])
-        axes.grid(visible=False, axis="y")
-    if factor == 100:
+    for axes, (title, group) in zip(panels, groups):
+        _draw_bars(axes, group, attributes, styles, metric, value)
+        axes.set_title(title)
+    if value == "recovered":
         _within_limits(panels[0].set_xlim, panels[0].get_xlim())
     legend_below(figure, list(styles))
     return figure
+
+
+def _attribute_groups(
+    summary: pd.DataFrame, metric: str
+) -> tuple[pd.DataFrame, list[tuple[str, pd.DataFrame]]]:
+    """The rows that are drawn, together and by trace and setting, whose name comes with them."""
+    chosen = summary[summary["metric"] == metric]
+    if (chosen["trace"] == ALL_TRACES).any():
+        chosen = chosen[chosen["trace"] == ALL_TRACES]
+    groups = []
+    for (trace, latency, scale, sigma), group in chosen.groupby(
+        ["trace", "latency", "scale", "sigma"], sort=False
+    ):
+        title = f"{trace}, {setting_label(latency, scale)}"
+        groups.append((title + (f", σ = {sigma:g}" if sigma else ""), group))  # noqa: RUF001
+    return chosen, groups
+
+
+def _attribute_counts(rows: pd.DataFrame) -> dict[str, int]:
+    """The number of sequences of each attribute."""
+    counts: dict[str, int] = rows.groupby("attribute", sort=False)["sequences"].max().to_dict()
+    return counts
+
+
+def _draw_bars(
+    axes: Axes,
+    rows: pd.DataFrame,
+    attributes: Mapping[str, int],
+    styles: Mapping[str, Style],
+    metric: str,
+    value: Literal["recovered", "mean"],
+    hatches: Sequence[str] = ("",),
+) -> None:
+    """Bars with intervals for each attribute, of one trace and setting."""
+    rivals = [n for n in styles if n != "offline" and (n != "hold" or value == "mean")]
+    places, factor = np.arange(len(attributes)), 100 if value == "recovered" else 1
+    for name in styles if value == "mean" else rivals:
+        one = rows[rows["forecaster"] == name].set_index("attribute").reindex([*attributes])
+        known = one[value].notna().to_numpy()
+        one, at = one[known], places[known]
+        middle = factor * one[value]
+        if name == "offline":
+            axes.plot(middle, at, "|", color="black", markersize=14, label=name)
+            continue
+        axes.barh(
+            at + _offset(rivals, name),
+            middle,
+            0.8 / len(rivals),
+            color=styles[name]["color"],
+            hatch=hatches[rivals.index(name) % len(hatches)],
+            label=name,
+            xerr=_errors(one, value, factor),
+            error_kw={"elinewidth": 0.8},
+        )
+    axes.set(
+        xlabel=_SHARE_LABEL if factor == 100 else _label(metric), ylim=(places[-1] + 0.5, -0.5)
+    )
+    axes.axvline(0, color="0.4", linewidth=0.8)
+    axes.set_yticks(places, [f"{name} (n = {count})" for name, count in attributes.items()])
+    axes.grid(visible=False, axis="y")
+
+
+def attributes_in_columns(
+    summary: pd.DataFrame, metric: str = "auc", of: str = ""
+) -> Iterator[ColumnFigure]:
+    """Bars for each attribute, a figure for a paper per trace and setting.
+
+    Args:
+        summary: what :func:`.statistics.by_attribute` gave.
+        metric: whose share recovered is drawn, or where that is not known whose mean.
+        of: what the names of the figures end in, beside trace and setting.
+    """
+    chosen, groups = _attribute_groups(summary, metric)
+    styles, attributes = _styles(chosen), _attribute_counts(chosen)
+    value: Literal["recovered", "mean"] = (
+        "recovered" if chosen["recovered"].notna().any() else "mean"
+    )
+    what = (
+        f"share of the {_label(metric)} lost that is recovered"
+        if value == "recovered"
+        else _label(metric)
+    )
+
+    def draw(axes: Axes, rows: pd.DataFrame) -> None:
+        _draw_bars(axes, rows, attributes, styles, metric, value, _HATCHES)
+        if value == "recovered":
+            _within_limits(axes.set_xlim, axes.get_xlim())
+
+    height = 0.5 + len(attributes) * max(0.17, 0.06 * len(styles))
+    for title, rows in groups:
+        yield ColumnFigure(
+            f"attributes-{metric}-{of or title}",
+            f"By attribute: {what}, with 95 % intervals where they are known; {title}",
+            column_figure(partial(draw, rows=rows), height),
+        )
 
 
 def _few_traces(summary: pd.DataFrame) -> pd.DataFrame:
