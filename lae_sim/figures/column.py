@@ -38,7 +38,7 @@ _LOOK = {
     "legend.handlelength": 2.6,  # as long as the longest pattern of dashes
     "legend.columnspacing": 1.0,
     "legend.labelspacing": 0.25,
-    "legend.borderpad": 0.1,
+    "legend.borderpad": 0.2,
     "lines.linewidth": 1.0,
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,

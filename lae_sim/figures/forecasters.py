@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,6 +18,7 @@ from lae_sim.figures.style import (
     legend_below,
     new_figure,
     panel_grid,
+    paper_styles,
     styled,
 )
 
@@ -145,7 +146,7 @@ def comparison_in_columns(
                 )
         for x in ("scale", "sigma"):
             if summary[x].nunique() > 1:
-                for panel in _panels(summary, x, metric, "mean"):
+                for panel in _panels(summary, x, metric, "mean", paper_styles):
                     yield ColumnFigure(
                         f"{metric}-over-{x}-{panel.title}",
                         f"{_label(metric)} over the {panel.xlabel}: {panel.title}",
@@ -187,12 +188,13 @@ def _panels(
     x: Literal["scale", "sigma"],
     metric: str,
     value: Literal["mean", "vs_hold"],
+    styles_of: Callable[[Iterable[str]], dict[str, Style]] = forecaster_styles,
 ) -> list[Panel]:
     """A panel for each trace and setting but for x."""
     chosen = _few_traces(summary[summary["metric"] == metric])
     if value == "vs_hold":
         chosen = chosen[chosen["forecaster"] != "offline"]
-    styles = _styles(chosen)
+    styles = styles_of(_styles(chosen))
     xlabel = "scale of the latency" if x == "scale" else "permitted latency σ (frames)"  # noqa: RUF001
     ylabel = _label(metric) + (" minus that of hold" if value == "vs_hold" else "")
     other = "sigma" if x == "scale" else "scale"

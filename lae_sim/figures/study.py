@@ -494,11 +494,12 @@ def study_in_columns(view: View) -> Iterator[ColumnFigure]:
             column_figure(partial(_draw_front, view=view, points=within), 2.4),
         )
     caption, rows, runs = _gaining(view)
-    for name, draw in (("won", _draw_won), ("recovered", _draw_recovered)):
-        if runs:
-            height = 0.5 + len(runs) * (0.13 + 0.06 * (len(view.forecasters) - 1))
-            figure = column_figure(partial(draw, view=view, rows=rows, runs=runs), height)
-            yield ColumnFigure(name, caption, figure)
+    height = 0.5 + len(runs) * (0.13 + 0.06 * (len(view.forecasters) - 1))
+    if runs:
+        won = column_figure(partial(_draw_won, view=view, rows=rows, runs=runs), height)
+        yield ColumnFigure("won", caption, won)
+        share = column_figure(partial(_draw_recovered, view=view, rows=rows, runs=runs), height)
+        yield ColumnFigure("recovered", f"Share of the loss won back. {caption}", share)
     for dataset, group in _attribute_rows(view):
         yield from attributes_in_columns(group, "auc", dataset)
     for trace in view.results.traces:

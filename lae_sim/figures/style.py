@@ -97,6 +97,13 @@ def forecaster_lines(names: Iterable[str]) -> dict[str, Any]:
     return {**fixed, **{name: _LINES[i % len(_LINES)] for i, name in enumerate(others)}}
 
 
+def paper_styles(names: Iterable[str]) -> dict[str, Style]:
+    """Colour, marker and line of each forecaster, which differ in grey print too."""
+    names = list(names)
+    styles, lines = forecaster_styles(names), forecaster_lines(names)
+    return {name: {**styles[name], "linestyle": lines[name]} for name in names}
+
+
 def tracker_styles(names: Iterable[str]) -> dict[str, Style]:
     """Colour and marker of each tracker (or trace) of a report."""
     n = len(_TRACKERS)
