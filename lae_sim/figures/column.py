@@ -118,6 +118,9 @@ def write_column_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
     }
     paths = [folder / f"{name}.{kind}" for kind in KINDS]
     with matplotlib.rc_context(settings), any_names(figure):
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)  # once for both
+        figure.set_layout_engine("none")
         for kind, path in zip(KINDS, paths):
             figure.savefig(path, format=kind, metadata=metadata[kind], dpi=300)
     return paths
