@@ -379,6 +379,24 @@ def check_outputs(
     check_places(path for path in written if not os.path.isdir(path))
 
 
+def check_folder(arguments: argparse.Namespace, folder: str) -> None:
+    """Refuse, before the work, a folder that figures and tables cannot be written to.
+
+    Raises:
+        LaeError: if it is a file, one that is read, or cannot be written to.
+    """
+    root = getattr(arguments, "root", None)
+    if os.path.exists(folder) and not os.path.isdir(folder):
+        raise LaeError(f"--out {folder}: is there already and is not a folder: name another")
+    if root and os.path.isdir(folder) and os.path.samefile(folder, root):
+        raise LaeError(f"--out {folder}: the frames are read from there: name another folder")
+    above = os.path.realpath(folder)
+    while not os.path.isdir(above):
+        above = os.path.dirname(above)
+    if not os.access(above, os.W_OK):
+        raise LaeError(f"--out {folder}: {above} cannot be written to: name another folder")
+
+
 def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]:
     """The worlds that the options of :func:`add_world` or :func:`add_worlds` name, in their order.
 

@@ -42,7 +42,7 @@ def latex_of(table: Table, is_long: bool = False) -> str:
         rf"\begin{{{environment}}}[t]",
         rf"\caption{{{tex(table.caption)}.}}",
         rf"\label{{{label}}}",
-        r"\centering\footnotesize",
+        r"\smallskip\centering\footnotesize",
         rf"\setlength{{\tabcolsep}}{{{4 if is_long else 3}pt}}",
         r"\sbox0{%",
         *_tabular(table, is_long),

@@ -195,7 +195,7 @@ def write_table(table: PaperTable, folder: Path) -> list[Path]:
             write(table.whole, temporary)
     for path, text in (
         (short, latex_of(_without_constants(table.short))),
-        (long, latex_of(table.long, is_long=True)),
+        (long, latex_of(_without_constants(table.long), is_long=True)),
     ):
         with written_whole(path) as temporary:
             temporary.write_text(text, "utf-8", "backslashreplace")

@@ -122,6 +122,7 @@ _RANKING = (
 )  # fmt: skip
 _COLUMN = ("AUC", "modelled", "offline", "DP", "ms/call")
 _PAPER = ("AUC", "modelled", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")
+_REQUIRED = ("auc_without_latency", "scale_at_most")  # of them in a column of a paper
 _TERMINAL = ("n", "AUC", "modelled", "ranked by", "jitter", "offline", "recovered", "vs hold", "p",
              "DP", "ms/call", "init ms", "skipped", "age ms", "front")  # fmt: skip
 _INTERVALS = ("AUC", "mAUC", "modelled", "jitter", "AUC of a - b", "mAUC of a - b")
@@ -334,7 +335,8 @@ def paper_tables(view: View) -> list[PaperTable]:
         tables.append(PaperTable(compared, compared, short))
     if view.results.required:
         required = required_table(view)
-        tables.append(PaperTable(required, required, required))
+        short = required.only(lambda _, column: column.is_label or column.key in _REQUIRED)
+        tables.append(PaperTable(required, required, short))
     return tables
 
 
