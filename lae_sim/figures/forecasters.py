@@ -114,18 +114,12 @@ def _name_settings(axes: Axes, settings: Sequence[str]) -> None:
         axes.axvline(edge - 0.5, color="0.85", linewidth=0.8)
 
 
-def comparison_in_columns(
-    summary: pd.DataFrame, metrics: Sequence[str], attributes: pd.DataFrame | None = None
-) -> Iterator[ColumnFigure]:
-    """The figures of a comparison for a paper.
-
-    The mean and the share recovered of each forecaster, by trace; over scale and permitted latency,
-    where there are several; and by attribute.
+def comparison_in_columns(summary: pd.DataFrame, metrics: Sequence[str]) -> Iterator[ColumnFigure]:
+    """The mean of each forecaster for a paper, and the share recovered, a figure for each trace.
 
     Args:
         summary: what :func:`.statistics.summarise` gave.
-        metrics: those drawn, the first also as share recovered and by attribute.
-        attributes: what :func:`.statistics.by_attribute` gave.
+        metrics: those drawn, the first also as share recovered.
     """
     for metric in metrics:
         chosen = _at_least_sigma(summary, metric)
@@ -144,16 +138,27 @@ def comparison_in_columns(
                     f"{trace}, with 95 % intervals over sequences",
                     column_figure(partial(_draw_all_shares, rows, settings, styles)),
                 )
-        for x in ("scale", "sigma"):
-            if summary[x].nunique() > 1:
-                for panel in _panels(summary, x, metric, "mean", paper_styles):
+
+
+def sweeps_in_columns(summary: pd.DataFrame, metrics: Sequence[str]) -> Iterator[ColumnFigure]:
+    """Metrics over scale and permitted latency for a paper, where there are several of them.
+
+    Over scale at the smallest permitted latency, and over that at scale 1, if it is among them.
+    """
+    scale = 1 if (summary["scale"] == 1).any() else summary["scale"].min()
+    of_x: dict[Literal["scale", "sigma"], pd.DataFrame] = {
+        "scale": summary[summary["sigma"] == summary["sigma"].min()],
+        "sigma": summary[summary["scale"] == scale],
+    }
+    for metric in metrics:
+        for x, rows in of_x.items():
+            if rows[x].nunique() > 1:
+                for panel in _panels(rows, x, metric, "mean", paper_styles):
                     yield ColumnFigure(
                         f"{metric}-over-{x}-{panel.title}",
                         f"{_label(metric)} over the {panel.xlabel}: {panel.title}",
                         panel_in_column(panel),
                     )
-    if attributes is not None:
-        yield from attributes_in_columns(attributes, metrics[0])
 
 
 def _draw_all_shares(
@@ -301,14 +306,15 @@ def _draw_bars(
 def attributes_in_columns(
     summary: pd.DataFrame, metric: str = "auc", of: str = ""
 ) -> Iterator[ColumnFigure]:
-    """Bars for each attribute, a figure for a paper per trace and setting.
+    """Bars for each attribute at the smallest sigma, a figure for a paper per trace and setting.
 
     Args:
         summary: what :func:`.statistics.by_attribute` gave.
         metric: whose share recovered is drawn, or where that is not known whose mean.
         of: what the names of the figures end in, beside trace and setting.
     """
-    chosen, groups = _attribute_groups(summary, metric)
+    first = summary[summary["sigma"] == summary["sigma"].min()]
+    chosen, groups = _attribute_groups(first, metric)
     styles, attributes = _styles(chosen), _attribute_counts(chosen)
     value: Literal["recovered", "mean"] = (
         "recovered" if chosen["recovered"].notna().any() else "mean"

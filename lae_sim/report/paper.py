@@ -194,8 +194,8 @@ def write_table(table: PaperTable, folder: Path) -> list[Path]:
         with written_whole(path) as temporary:
             write(table.whole, temporary)
     for path, text in (
-        (short, latex_of(_without_constants(table.short))),
-        (long, latex_of(_without_constants(table.long), is_long=True)),
+        (short, latex_of(_for_latex(table.short))),
+        (long, latex_of(_for_latex(table.long), is_long=True)),
     ):
         with written_whole(path) as temporary:
             temporary.write_text(text, "utf-8", "backslashreplace")
@@ -230,8 +230,15 @@ def write_frame_file(frame: DataFrame, path: Path) -> None:
                 frame.to_parquet(file, index=False)
 
 
-def _without_constants(table: Table) -> Table:
-    """A table whose labels that are the same in all rows are in its caption instead."""
+MOST_ROWS = 50
+"""More rows of a table do not fit a page."""
+
+
+def _for_latex(table: Table) -> Table:
+    """A table whose labels that are the same in all rows are in its caption, and that fits."""
+    if (count := len(table.rows)) > MOST_ROWS:
+        caption = f"{table.caption}; {MOST_ROWS} of {count:,} rows, all in {table.name}.csv"
+        table = replace(table, rows=table.rows[:MOST_ROWS], caption=caption)
     constant = {
         place: row[place].text
         for row in table.rows[:1]
