@@ -76,6 +76,7 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set(title=panel.title, xlabel=panel.xlabel, ylabel=panel.ylabel)
     if panel.logarithmic:
         axes.set_xscale("log", base=2)
+        axes.xaxis.set_major_formatter("{x:g}")  # powers would be mathematics, which no text is
     xs = np.unique(np.concatenate([np.ravel(line.x) for line in panel.lines]))
     if len(xs) <= MOST_TICKS:
         axes.set_xticks(xs, [f"{x:g}" for x in xs], minor=False)

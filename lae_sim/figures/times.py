@@ -11,6 +11,7 @@ from lae_sim.figures.style import BLUE, VERMILION
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
 
 def draw_times(axes: Axes, times: Mapping[str, Any]) -> None:
@@ -34,7 +35,9 @@ def draw_times(axes: Axes, times: Mapping[str, Any]) -> None:
     axes.stairs(shares / np.diff(np.log2(edges)), edges, fill=True, color=BLUE)
     axes.set_xscale("log")
     interval = times["frame_interval_ms"]
-    if edges[0] < interval < edges[-1]:
+    left, right = edges[0], edges[-1]
+    if left / 4 < interval < 4 * right:
+        left, right = min(left, interval), max(right, interval)
         axes.axvline(interval, color=VERMILION, linestyle="--", linewidth=1)
     if stalls := [stall["ms"] for stall in times["stalls"]]:
         up = axes.get_xaxis_transform()
@@ -50,23 +53,26 @@ def draw_times(axes: Axes, times: Mapping[str, Any]) -> None:
             va="bottom",
             color=VERMILION,
         )
-    _name_durations(axes, edges[0], edges[-1])
+    axes.set_xlim(left / 1.15, right * 1.15)
+    name_durations(axes.xaxis, left, right)
     shorter = f"; {found['below']:,} of {calls['n']:,} calls are shorter" if found["below"] else ""
     axes.set(xlabel=f"time of a call{shorter}", ylabel="density (per doubling)")
 
 
-def _name_durations(axes: Axes, shortest: float, longest: float) -> None:
-    """Ticks at round durations: 1, 2 and 5 times powers of ten where there are few of these."""
+def name_durations(axis: Axis, shortest: float, longest: float) -> None:
+    """Have a logarithmic axis of times in ms name round ones, with their units.
+
+    These are 1, 2 and 5 times powers of ten where there are few of them.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     decades = np.log10(longest / shortest)
     steps: tuple[float, ...] = (1.0, 2.0, 5.0) if decades < 2 else (1.0,)
     if decades < 0.4:
         steps = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
-    axes.xaxis.set_major_locator(LogLocator(subs=steps, numticks=12))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda ms, _: _duration(ms)))
-    axes.set_xlim(shortest / 1.15, longest * 1.15)
+    axis.set_major_locator(LogLocator(subs=steps, numticks=12))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda ms, _: _duration(ms)))
 
 
 def _duration(ms: float) -> str:
