@@ -177,7 +177,7 @@ def _check_files(arguments: argparse.Namespace, traces: Sequence[str]) -> None:
     """Refuse what would only fail after the work."""
     outputs = [arguments.plot]
     if arguments.out and _is_folder(arguments.out):
-        check_folder(arguments, arguments.out)
+        check_folder(arguments, arguments.out, ", or a .csv or .parquet file")
     else:
         outputs.append(arguments.out)
     check_outputs(arguments, outputs, traces)

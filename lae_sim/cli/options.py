@@ -379,12 +379,21 @@ def check_outputs(
     check_places(path for path in written if not os.path.isdir(path))
 
 
-def check_folder(arguments: argparse.Namespace, folder: str) -> None:
+def check_folder(arguments: argparse.Namespace, folder: str, or_else: str = "") -> None:
     """Refuse, before the work, a folder that figures and tables cannot be written to.
 
+    Args:
+        arguments: which say what is read.
+        folder: the folder.
+        or_else: what else could be named.
+
     Raises:
-        LaeError: if it is a file, one that is read, or cannot be written to.
+        LaeError: if it is a file, or called like one, or one that is read, or cannot be written to.
     """
+    if os.path.splitext(folder)[1] and not os.path.isdir(folder):
+        raise LaeError(
+            f"--out {folder}: name a folder{or_else}; that of a folder with a point in it ends in /"
+        )
     root = getattr(arguments, "root", None)
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise LaeError(f"--out {folder}: is there already and is not a folder: name another")
