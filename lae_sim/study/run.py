@@ -18,7 +18,7 @@ from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
 from lae_sim.study.cells import Task
-from lae_sim.study.deployment import Slowest, requirement, searches
+from lae_sim.study.deployment import Curve, requirement, searches
 from lae_sim.study.executors import cores, run_all
 from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import Comparison, Failure, Record, Requirement, SummaryRow
@@ -239,7 +239,7 @@ def _run(
 ) -> StudyResults:
     study = plan.study
     store.prepare(plan.cells)
-    asked = [] if study.require_auc is None else searches(plan.cells, study.require_auc)
+    asked = searches(plan.cells, study.require_auc) if study.require_auc else []
     described = [Description(source.input, study.sequences) for source in plan.sources]
     cells = [cell for cell in plan.cells if not store.has(cell)]
     sought = [search for search in asked if store.document(search.key) is None]
@@ -279,7 +279,10 @@ def _run(
         summary=tuple(summarise_study(scores, study.seed)),
         comparisons=tuple(compare_traces(scores, study.seed)),
         required=tuple(
-            requirement(search, Slowest(**answer)) for search, answer in answers if answer
+            requirement(search, Curve(**answer), auc)
+            for search, answer in answers
+            if answer
+            for auc in search.required
         ),
         traces=tuple(filter(None, (store.document(each.key) for each in described))),
         computed=computed,
