@@ -152,9 +152,7 @@ def _coarse() -> list[int]:
     return [0, 1, *(step for step in steps if step < MOST), MOST]
 
 
-def mean_auc(
-    search: Search, scale: Fraction, trace: Trace
-) -> tuple[float, float | None, bool]:
+def mean_auc(search: Search, scale: Fraction, trace: Trace) -> tuple[float, float | None, bool]:
     """The mean AUC over sequences and repetitions at a scale of all times.
 
     It is the one by which the replay would be ranked (:class:`.modelled.Ranking`). With it: the

@@ -31,6 +31,7 @@ from lae_sim.study.summary import (
     read_scores,
     summarise_study,
 )
+from lae_sim.study.verdict import verdict
 from lae_sim.study.work import Description, Work, attempt
 from lae_sim.trace.describe import is_measured
 
@@ -69,6 +70,8 @@ class StudyResults:
           forecaster    auc  vs_hold_auc
         0       hold  0.572          NaN
         1     kalman  0.629        0.057
+        >>> print(*results.verdict())
+        slow-and-accurate with kalman is best: AUC 0.629 [0.573, 0.687]; no difference shown: slow-and-accurate with hold (up to 0.057 behind, p at least 0.078).
     """
 
     folder: Path
@@ -165,6 +168,10 @@ class StudyResults:
             notes += [f"{trace['trace']}: {text}" for text in trace["warnings"]]
         return list(dict.fromkeys(notes))
 
+    def verdict(self) -> list[str]:
+        """What it comes to, in words (see :func:`lae_sim.study.verdict.verdict`)."""
+        return verdict(self.summary, self.required)
+
     def document(self) -> dict[str, Any]:
         """All but the scores of single sequences, as ``study.json`` holds it."""
         return {
@@ -172,6 +179,7 @@ class StudyResults:
             "version": "1.0",
             "lae_sim": __version__,
             "study": self.plan.study.document(),
+            "verdict": self.verdict(),
             "cells": len(self.plan.cells),
             "failures": flat_rows(self.failures),
             "notes": self.notes(),
