@@ -23,10 +23,10 @@ STEP = Fraction(1, 100)
 MOST = 1 << 13
 """Scales are tried in hundredths, up to 81.92: all times so much longer."""
 
-FINE = 20
+FINE = 10
 """Scales that are tried between two coarse ones, at most, where only one of them is enough."""
 
-_GROWTH = 1.2  # of the coarse scales
+_GROWTH = 1.1  # of the coarse scales
 _RELATIVE = ("latest", "fifo", "every")  # policies that know no absolute times
 
 HELD = 1_000_000
@@ -112,9 +112,10 @@ def scan(auc: Callable[[int], float], required: Sequence[Fraction]) -> dict[int,
     """The AUC at scales in hundredths, by scale, ascending; dense where it crosses what is asked.
 
     No order is assumed: stalls, and calls that come into step with the camera, make the AUC rise
-    with slower times. Coarse scales are tried, each a fifth above the one before, up to twice the
+    with slower times. Coarse scales are tried, each a tenth above the one before, up to twice the
     last that is enough; between two of which one only is enough, `FINE` in an even distance; and
-    each change between these is followed to the hundredth.
+    each change between these is followed to the hundredth. (What comes and goes between two coarse
+    scales is not seen.)
     """
     known: dict[int, float] = {}
 
@@ -130,25 +131,28 @@ def scan(auc: Callable[[int], float], required: Sequence[Fraction]) -> dict[int,
         if step >= 2 * last:
             break
 
-    def changes(least: Fraction) -> list[tuple[int, int]]:
-        tried = sorted(known)
-        return [(a, b) for a, b in pairwise(tried) if enough(a, least) != enough(b, least)]
+    def changes() -> list[tuple[int, int]]:
+        """Neighbours of which one only is enough for something."""
+        pairs = list(pairwise(sorted(known)))
+        return [
+            (low, high)
+            for least in required
+            for low, high in pairs
+            if high - low > 1 and enough(low, least) != enough(high, least)
+        ]
 
-    for least in required:
-        for low, high in changes(least):
-            for step in range(low, high, max(1, -((low - high) // FINE))):
-                enough(step, least)
-        for low, high in changes(least):
-            before = enough(low, least)
-            while high - low > 1:
-                middle = (low + high) // 2
-                low, high = (middle, high) if enough(middle, least) == before else (low, middle)
+    for low, high in changes():
+        for step in range(low, high, -((low - high) // FINE)):
+            enough(step, required[0])
+    while crossings := changes():  # halved until they are neighbouring hundredths
+        for low, high in crossings:
+            enough((low + high) // 2, required[0])
     return dict(sorted(known.items()))
 
 
 def _coarse() -> list[int]:
     """0, and scales in hundredths from 0.01 to the largest, 1 among them."""
-    steps = [round(100 * _GROWTH**k) for k in range(-12, 25)]
+    steps = [round(100 * _GROWTH**k) for k in range(-23, 47)]
     return [0, 1, *(step for step in steps if step < MOST), MOST]
 
 

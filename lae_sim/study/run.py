@@ -71,7 +71,7 @@ class StudyResults:
         0       hold  0.572          NaN
         1     kalman  0.629        0.057
         >>> print(*results.verdict())
-        slow-and-accurate with kalman is best: AUC 0.629 [0.573, 0.687]; no difference shown: slow-and-accurate with hold (up to 0.057 behind, p at least 0.078).
+        slow-and-accurate with kalman is best: AUC 0.629 [0.573, 0.687]; no difference shown: ...
     """
 
     folder: Path
