@@ -327,19 +327,18 @@ def required_table(view: View) -> Table:
     """A row per trace, setting, forecaster and AUC asked: how slow the tracker may be."""
     rows = view.results.required
     columns = [
-        Column("tracker", lambda row: view.names.get(row.run, row.run), is_label=True),
-        *_names(_differing(rows, [key for key in SETTINGS if key != "scale"])),
+        *_names(["tracker", *_differing(rows, [key for key in SETTINGS if key != "scale"])]),
         *_names(["forecaster"]),
         Column("AUC asked", "required_auc", Number(".3g")),
         Column("ms per frame", "safe_ms_per_frame", significant,
                "the slowest mean time of a call, the initialisations apart"),
         Column("fps", "safe_frames_per_second", significant,
                "frames that a tracker of this time processes per second"),
-        Column("device", _device, meaning="against the times that are replayed"),
+        Column("device", "device", meaning="against the times that are replayed"),
         Column("AUC there", "safe_auc", FINE_SCORE),
         Column("then", "next_auc", FINE_SCORE, "AUC with all times a hundredth longer"),
         Column("offline", "auc_without_latency", SCORE, "AUC without latency"),
-        Column("or world fps", _world, _MS, "how fast the world may move instead, with the "
+        Column("or world fps", "world", _MS, "how fast the world may move instead, with the "
                "recorded motion from frame to frame; unknown where a cost or a policy has a time "
                "of its own"),
     ]  # fmt: skip
@@ -347,7 +346,15 @@ def required_table(view: View) -> Table:
         columns.append(Column("AUC is", "ranked_by", meaning="as the ranking has it"))
     return Table.of(
         columns,
-        rows,
+        [
+            {
+                **row.flat(),
+                "tracker": view.names.get(row.run, row.run),
+                "device": _device(row),
+                "world": _world(row),
+            }
+            for row in rows
+        ],
         "required",
         f"How slow a tracker may be for the required AUC at sigma {rows[0].sigma}",
     )
