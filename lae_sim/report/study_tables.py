@@ -87,15 +87,15 @@ _COUNT, _MS, _RATIO, _RECOVERED = (
     Number(".0f"), Number(".1f"), Number(".2f"), Number(".1f", 100, "%", ".0f")
 )  # fmt: skip
 _RANKING = (
-    Column("n", "sequences", _COUNT, "number of sequences"),
+    Column("n", "sequences", _COUNT, "number of sequences", importance=3),
     Column("AUC", "auc", SCORE, "with its 95 % interval over sequences"),
     Column("modelled", "modelled_auc", SCORE, "AUC under the search model, with its interval"),
     Column("ranked by", "ranked_by", meaning="whose AUC is ranked, compared and tested"),
     Column("jitter", _jitter, meaning="the range of 95 % of the repetitions' AUC",
-           name="auc_jitter"),
+           name="auc_jitter", importance=3),
     Column("offline", "offline_auc", SCORE, "AUC without latency"),
     Column("change", lambda row: relative_change(row["ranked_auc"], row["offline_auc"]), CHANGE,
-           "of the AUC, to offline", name="auc_change"),
+           "of the AUC, to offline", name="auc_change", importance=3),
     Column("recovered", "recovered_auc", _RECOVERED,
            "share of the AUC lost to latency that the forecaster wins back"),
     Column("vs hold", "vs_hold_auc", SIGNED, "AUC won over hold"),
@@ -105,26 +105,26 @@ _RANKING = (
     Column("p (best)", "vs_best_auc_p_holm", p_label, "of no difference to the best: the same "
            "test, corrected by Holm's method for the number of those compared with it"),
     Column("DP", "dp20", SCORE, "precision at 20 px"),
-    Column("modelled DP", "modelled_dp20", SCORE, "under the search model"),
-    Column("lost", "lost_share", PERCENT, "share of the outputs answered while the target is lost"),
-    Column("offline DP", "offline_dp20", SCORE, "without latency"),
+    Column("modelled DP", "modelled_dp20", SCORE, "under the search model", importance=3),
+    Column("lost", "lost_share", PERCENT, "share of the outputs answered while the target is lost", importance=3),
+    Column("offline DP", "offline_dp20", SCORE, "without latency", importance=3),
     Column("ms/call", "elapsed_ms", _MS, "mean processing time"),
-    Column("init ms", "init_ms", _MS, "mean time of an initialisation; the notes say where from"),
+    Column("init ms", "init_ms", _MS, "mean time of an initialisation; the notes say where from", importance=3),
     Column("skipped", "skip_rate", PERCENT, "share of frames never processed"),
     Column("age ms", "age_ms", _COUNT, "mean age of the outputs that answer, at the first sigma; "
            "what forecasting costs is not in it"),
-    Column("stale ms", "longest_stale_ms", _COUNT, "longest time that one output answered"),
+    Column("stale ms", "longest_stale_ms", _COUNT, "longest time that one output answered", importance=3),
     Column("failed", "failed", PERCENT,
-           "share of sequences in which an answer misses the target wholly"),
+           "share of sequences in which an answer misses the target wholly", importance=3),
     Column("to failure s", "time_to_failure_ms", Number(".1f", 1e-3), "median time to the first "
-           "such answer (Kaplan and Meier); unknown if less than half fail"),
+           "such answer (Kaplan and Meier); unknown if less than half fail", importance=3),
     Column("front", lambda row: Cell("★" if row["pareto"] else "", int(row["pareto"])),
            meaning="with the same forecaster, no other trace is both faster and better",
            name="pareto"),
     Column("replay", _exactness,
            meaning="the share of outputs that follow another frame than when recorded",
-           name="approximate_share"),
-    Column("engine", "engine", meaning="batch, or simpy where policy or latency need it"),
+           name="approximate_share", importance=3),
+    Column("engine", "engine", meaning="batch, or simpy where policy or latency need it", importance=3),
 )  # fmt: skip
 _COLUMN = ("AUC", "modelled", "offline", "DP", "ms/call")
 _PAPER = ("AUC", "modelled", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")

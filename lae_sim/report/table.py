@@ -108,6 +108,8 @@ class Column:
         is_label: whether it names the rows; such columns come first, and are left-aligned.
         group: a heading above this and the neighbouring columns of the same group.
         name: its heading in CSV and Parquet, if it is not the name of the value.
+        importance: where there is no room for all columns, those of the least are left out; 5 is
+            that of most.
     """
 
     title: str
@@ -117,6 +119,7 @@ class Column:
     is_label: bool = False
     group: str = ""
     name: str = ""
+    importance: int = 5
 
     @property
     def key(self) -> str:
@@ -184,6 +187,19 @@ class Table:
         kept = [place for place, column in enumerate(self.columns) if keep(place, column)]
         rows = tuple(tuple(row[place] for place in kept) for row in self.rows)
         return replace(self, columns=tuple(self.columns[place] for place in kept), rows=rows)
+
+    @property
+    def minor(self) -> set[int]:
+        """The places of the columns that need not be seen: unimportant, or the same label always."""
+        return {
+            place
+            for place, column in enumerate(self.columns)
+            if column.importance < 5
+            or (place and column.is_label and len(self.rows) > 1 and self._is_constant(place))
+        }
+
+    def _is_constant(self, place: int) -> bool:
+        return len({row[place].text for row in self.rows}) == 1
 
     @property
     def groups(self) -> list[tuple[str, int]]:
