@@ -18,9 +18,10 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.boxes import iou
+from lae_sim.datasets.frames import Image
 from lae_sim.errors import LaeError, explained
 from lae_sim.evaluation.evaluate import Answers, answers
-from lae_sim.figures.film import images_of
+from lae_sim.figures.film import Scene, images_of
 from lae_sim.figures.style import forecaster_colours
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.folds import Trainer
@@ -41,13 +42,30 @@ MOST_FRAMES, MOST_PICTURES = 1500, 100
 """World frames of a sequence from its start, and pictures of successive ones among them."""
 MOST_BYTES = 600_000
 """Of the pictures of a sequence, together."""
-PICTURE_WIDTH, QUALITY = 400, 55
-"""Of the pictures, JPEG: pixels, and percent."""
+PICTURE_WIDTH, TARGET_WIDTH, QUALITY = 320, 200, 55
+"""Of the pictures and of those of the target, at most: pixels; and percent, as JPEG has it."""
+AROUND = 3
+"""Sides of the target (the larger one) that a picture of it is wide."""
 
 PIXELS = 8
 """Of the timeline for each frame interval."""
 IOU_HEIGHT, AGE_HEIGHT, LANE_HEIGHT = 100, 40, 14
 """Of the plots and lanes of the timeline, pixels."""
+
+
+@dataclass(frozen=True)
+class Still:
+    """A picture of a frame.
+
+    Attributes:
+        whole: the frame, small, a JPEG file.
+        target: what is around the truth, likewise; empty if there is no truth.
+        place: where that is, ``x, y, w, h`` in pixels of the frame.
+    """
+
+    whole: bytes
+    target: bytes = b""
+    place: tuple[int, int, int, int] = (0, 0, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +78,7 @@ class CloseUp:
         answers: what forecasters answer for every world frame, by name; hold is the first.
         size: width and height of its images, or of what holds all boxes, pixels.
         first: the frame of the first picture.
-        pictures: JPEG files of successive frames; none if there are no images.
+        pictures: of successive frames; none if there are no images.
     """
 
     run: Run
@@ -68,7 +86,7 @@ class CloseUp:
     answers: Mapping[str, Answers]
     size: tuple[float, float]
     first: int
-    pictures: Sequence[bytes]
+    pictures: Sequence[Still]
 
     @property
     def name(self) -> str:
@@ -84,6 +102,11 @@ class CloseUp:
     def start(self) -> int:
         """The frame that is shown first."""
         return self.first + len(self.pictures) // 2
+
+    @property
+    def still(self) -> Still | None:
+        """The picture of that frame."""
+        return self.pictures[self.start - self.first] if self.pictures else None
 
     @property
     def colours(self) -> dict[str, str]:
@@ -183,10 +206,17 @@ class CloseUp:
                     for values in self.overlaps.values()
                 ],
                 "first": self.first,
-                "pictures": [base64.b64encode(each).decode() for each in self.pictures],
+                "pictures": [
+                    [_base64(each.whole), _base64(each.target), *each.place]
+                    for each in self.pictures
+                ],
             },
             separators=(",", ":"),
         )
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
 
 
 def _bars(starts: Floats, lengths: Floats) -> str:
@@ -224,8 +254,8 @@ def close_ups(
     setting = of_run["hold"].setting
     chosen = _chosen(view, of_run, next(reversed(factories)))
     said = [
-        f"{run_of(rows['hold'])}, the best of the ranking, at the first sigma; "
-        f"{len(chosen)} of {len(of_run['hold'].sequences):,} sequences"
+        f"{len(chosen)} of {len(of_run['hold'].sequences):,} sequences of "
+        f"{view.names[run_of(rows['hold'])]}, the best of the ranking, at the first sigma"
     ]
     if len(factories) < len(rows):
         said[0] += f"; of the forecasters {', '.join(factories)}"
@@ -286,12 +316,12 @@ def _chosen(view: View, of_run: Mapping[str, Scores], forecaster: str) -> dict[s
 
     gains = aucs(forecaster) - (0 if forecaster == "hold" else aucs("hold"))
     order = [s for s in np.argsort(-gains, kind="stable").tolist() if np.isfinite(gains[s])]
-    what = "AUC of hold {:.3f}" if forecaster == "hold" else f"{forecaster} wins {{:+.3f}} of AUC"
+    what = "AUC {:.3f}" if forecaster == "hold" else f"AUC {{:+.3f}} from hold to {forecaster}"
     found = {}
-    for place, words in ((0, "the most"), (len(order) // 2, "in the middle"), (-1, "the least")):
+    for place, words in ((0, "the most"), (-1, "the least"), (len(order) // 2, "the median")):
         if order:
             s = order[place]
-            found.setdefault(of_run["hold"].sequences[s], f"{what.format(gains[s])}, {words}")
+            found.setdefault(of_run["hold"].sequences[s], f"{what.format(gains[s])}: {words}")
     return dict([*found.items()][:MOST_SEQUENCES])
 
 
@@ -299,13 +329,13 @@ def _images(
     run: Run, metadata: Metadata, root: str | os.PathLike[str] | None
 ) -> tuple[ImageSequence | None, str]:
     """The images of a sequence, or why there are none."""
-    if root is None and metadata.dataset != "synthetic":
-        return None, "without frames: lae-sim study --root says where the dataset's images are"
     try:
         images = images_of(run.recording, metadata, root)
-        images.read(0)
+        Scene.of(run, images, metadata, {}).images.read(0)
     except LaeError as error:
-        return None, f"{run.recording.name}: no frames: {error}"
+        if root is not None:
+            return None, f"{run.recording.name}: no frames: {error}"
+        return None, "without frames: lae-sim study --root says where the dataset's images are"
     return images, ""
 
 
@@ -329,7 +359,7 @@ def _close_up(
             size = sizes.at(0)
         return CloseUp(run, why, answered, size, first + count // 2, ())
     height, width = images.read(first).shape[:2]
-    pictures = _pictures(images, range(first, first + count))
+    pictures = _pictures(images, run.recording.truth, range(first, first + count))
     return CloseUp(run, why, answered, (width, height), first, [*pictures])
 
 
@@ -340,19 +370,35 @@ def _extent(boxes: Iterable[Floats]) -> tuple[float, float]:
     return max(float(width), 1.0), max(float(height), 1.0)
 
 
-def _pictures(images: ImageSequence, frames: range) -> Iterator[bytes]:
-    """Small JPEG files of frames, as many as may be."""
-    import cv2
-
+def _pictures(images: ImageSequence, truth: Floats, frames: range) -> Iterator[Still]:
+    """Pictures of frames, as many as may be."""
     total = 0
     for frame in frames:
         image = images.read(frame)
+        whole = _jpeg(image, PICTURE_WIDTH)
+        still = Still(whole)
         height, width = image.shape[:2]
-        if width > PICTURE_WIDTH:
-            size = PICTURE_WIDTH, max(1, round(height * PICTURE_WIDTH / width))
-            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-        total += len(encoded)
+        x, y, w, h = truth[frame].tolist()
+        if x == x:
+            reach = AROUND * max(w, h, 8) / 2
+            left, right = (round(min(max(x + w / 2 + s * reach, 0), width)) for s in (-1, 1))
+            top, bottom = (round(min(max(y + h / 2 + s * reach, 0), height)) for s in (-1, 1))
+            if left < right and top < bottom:
+                target = _jpeg(image[top:bottom, left:right], TARGET_WIDTH)
+                still = Still(whole, target, (left, top, right - left, bottom - top))
+        total += len(still.whole) + len(still.target)
         if total > MOST_BYTES:
             return
-        yield encoded.tobytes()
+        yield still
+
+
+def _jpeg(image: Image, most: int) -> bytes:
+    """A JPEG file of an image, so many pixels wide at most."""
+    import cv2
+
+    height, width = image.shape[:2]
+    if width > most:
+        size = most, max(1, round(height * most / width))
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return encoded.tobytes()

@@ -9,6 +9,9 @@ from xml.etree import ElementTree
 _KEPT = {"svg", "g", "defs", "clipPath", "path", "rect", "use", "text", "tspan"}
 _COLOUR = re.compile(r"#[0-9a-f]{6}\b")
 _REFERENCE = re.compile(r"(?<=url\(#)[^)]+|(?<=^#).+")
+_FRACTION = re.compile(r"(?<=\.\d\d)\d+")
+_PIXELS = 4 / 3
+"""Of a point."""
 _PAGE, _INK = "#14181f", "#e4e8ef"
 _CONTRAST = 4.5
 """Of colours on a dark page, at least: what WCAG 2.2 asks of text (AA)."""
@@ -39,16 +42,20 @@ def inlined(svg: bytes, label: str, prefix: str) -> str:
             if key == "id":
                 if value in referred:
                     found[key] = f"{prefix}-{value}"
+            elif key in ("d", "x", "y"):
+                found[key] = _FRACTION.sub("", " ".join(value.split()))
             elif not key.startswith("on"):
                 value = _REFERENCE.sub(lambda name: f"{prefix}-{name[0]}", value)
                 found[key] = _COLOUR.sub(lambda colour: variable(colour[0]), value)
         each.attrib = found
-    width, height = (str(round(float(end))) for end in root.attrib["viewBox"].split()[2:])
+    points = root.attrib["viewBox"].split()[2:]
+    width, height = (str(round(float(end) * _PIXELS)) for end in points)
     root.attrib = {
         "xmlns": "http://www.w3.org/2000/svg",
         "viewBox": root.attrib["viewBox"],
         "width": width,
         "height": height,
+        "stroke-linejoin": "round",
         "role": "img",
         "aria-label": label,
     }

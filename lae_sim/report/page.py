@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
-from lae_sim.errors import visible
+from lae_sim.errors import listed, visible
 from lae_sim.evaluation.metrics import CONVENTIONS, Convention
 from lae_sim.figures import study as study_figures
 from lae_sim.figures.study import SWEEPS, Picture
@@ -32,8 +32,8 @@ from lae_sim.study.view import View
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
 
-STALLS = 5
-"""Stalls that are listed of each trace."""
+STALLS, MOST_NAMES = 5, 3
+"""Stalls that are listed of each trace, and traces that are named for what they share."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,12 @@ def _search_facts(results: StudyResults) -> dict[str, str]:
     """What modelled scores rest on, and by what is ranked; empty where nothing is modelled."""
     if not (sources := results.search_sources()):
         return {}
-    return {"search model": "; ".join(sources), "ranking": "; ".join(results.ranked_by())}
+    traces: dict[str, list[str]] = {}
+    for source in sources:
+        trace, _, what = source.partition(": ")
+        traces.setdefault(what, []).append(trace)
+    said = [f"{listed(some, MOST_NAMES)}: {what}" for what, some in traces.items()]
+    return {"search model": "; ".join(said), "ranking": "; ".join(results.ranked_by())}
 
 
 def _sections(view: View, root: str | os.PathLike[str] | None) -> Iterator[Section]:

@@ -139,10 +139,11 @@ function frameAt(arrivals, time) {
 function watchable(figure) {
   const data = JSON.parse(figure.dataset.closeup), find = selector => figure.querySelector(selector);
   const [slider, play, output] = ["input", ".controls button", "output"].map(find);
-  const [strip, overview, image] = [".strip", ".overview", "image"].map(find);
+  const [strip, overview, stages] = [".strip", ".overview", ".stages"].map(find);
+  const [whole, target] = figure.querySelectorAll("image");
   const rects = [...figure.querySelectorAll(".stages g rect")];
   const values = [...figure.querySelectorAll(".legend b")];
-  const scroller = strip.parentElement, zoom = find(".zoom"), whole = overview.viewBox.baseVal.width;
+  const scroller = strip.parentElement, zoom = find(".zoom"), length = overview.viewBox.baseVal.width;
   let timer = null;
 
   function show(frame) {
@@ -153,8 +154,13 @@ function watchable(figure) {
         rects[b].setAttribute(name, k < 2 ? place[k] : Math.max(place[k], 0)));
     });
     const picture = data.pictures[frame - data.first];
-    image.style.display = picture ? "" : "none";
-    if (picture) image.setAttribute("href", `data:image/jpeg;base64,${picture}`);
+    for (const image of [whole, target]) if (image) image.style.display = picture ? "" : "none";
+    stages.style.setProperty("--truth", picture ? "#fff" : "initial");
+    if (picture) {
+      whole.setAttribute("href", `data:image/jpeg;base64,${picture[0]}`);
+      target.setAttribute("href", picture[1] ? `data:image/jpeg;base64,${picture[1]}` : "");
+      ["x", "y", "width", "height"].forEach((name, k) => target.setAttribute(name, picture[2 + k]));
+    }
     const centre = data.boxes[0][frame] || data.boxes[1][frame];
     if (centre) {
       const [x, y, w, h] = centre, side = Math.max(3 * Math.max(w, h), 24);
@@ -192,11 +198,11 @@ function watchable(figure) {
     return frameAt(data.arrivals, (event.clientX - place.left) / place.width * width / 8);
   };
   slider.addEventListener("input", () => { stop(); go(Number(slider.value)); });
-  strip.addEventListener("pointermove", event => { stop(); show(at(event, strip, whole)); });
+  strip.addEventListener("pointermove", event => { stop(); show(at(event, strip, length)); });
   for (const kind of ["pointerdown", "pointermove"]) overview.addEventListener(kind, event => {
     if (kind === "pointerdown" || event.buttons || event.pointerType === "mouse") {
       stop();
-      go(at(event, overview, whole));
+      go(at(event, overview, length));
     }
   });
   play.addEventListener("click", () => {
