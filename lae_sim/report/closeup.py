@@ -136,6 +136,12 @@ class CloseUp:
         """Of the timeline, pixels."""
         return float(PIXELS * self.arrivals[-1])
 
+    @property
+    def pictured(self) -> tuple[float, float]:
+        """Where the frames with pictures begin on the timeline, and how wide they are, pixels."""
+        begin, end = PIXELS * self.arrivals[[self.first, self.first + len(self.pictures)]]
+        return float(begin), float(end - begin)
+
     def frames(self, taken: bool) -> str:
         """A path of the frames that were processed, or of those that were skipped."""
         processed = np.isin(np.arange(self.length), self.run.schedule.frames)
@@ -197,6 +203,7 @@ class CloseUp:
         truth, answered = self.run.recording.truth, self.answers.values()
         return json.dumps(
             {
+                "pixels": PIXELS,
                 "fps": float(self.run.schedule.clock.fps),
                 "arrivals": np.round(self.arrivals[:-1], 3).tolist(),
                 "ages": self.age[shown].tolist(),

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from xml.etree import ElementTree
 
 _KEPT = {"svg", "g", "defs", "clipPath", "path", "rect", "use", "text", "tspan"}
-_COLOUR = re.compile(r"#[0-9a-f]{6}\b")
+_COLOUR = re.compile(r"#[0-9a-fA-F]{6}\b")
 _REFERENCE = re.compile(r"(?<=url\(#)[^)]+|(?<=^#).+")
 _FRACTION = re.compile(r"(?<=\.\d\d)\d+")
 _PIXELS = 4 / 3
@@ -69,7 +69,7 @@ def variable(colour: str) -> str:
 
 def dark_colours(texts: Iterable[str]) -> dict[str, str]:
     """What the variables of all colours in some texts are on a dark page."""
-    colours = dict.fromkeys(colour for text in texts for colour in _COLOUR.findall(text.lower()))
+    colours = dict.fromkeys(each.lower() for text in texts for each in _COLOUR.findall(text))
     return {f"--c{colour[1:]}": in_the_dark(colour) for colour in colours}
 
 

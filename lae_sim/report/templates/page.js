@@ -48,7 +48,9 @@ function spans(widths, shown) {
   return widths.map(width => shown.slice(start, start += width).filter(Boolean).length);
 }
 function choosable(table) {
-  const heads = headings(table), groups = [...table.querySelectorAll("tr.groups > *")];
+  const heads = headings(table), minor = heads.filter(head => head.hasAttribute("data-minor"));
+  if (!minor.length && heads.length < 8) return;
+  const groups = [...table.querySelectorAll("tr.groups > *")];
   const widths = groups.map(group => group.colSpan);
   const above = widths.flatMap((width, g) => Array(width).fill(groups[g].textContent.trim()));
   const boxes = heads.map((head, column) =>
@@ -71,7 +73,7 @@ function choosable(table) {
   boxes.forEach((box, column) => box.addEventListener("change", () => { show([column]); count(); }));
   all.addEventListener("click", () => {
     for (const box of boxes) box.checked = true;
-    show(boxes.keys());
+    show([...boxes.keys()]);
     count();
   });
   const chooser = made("details", { className: "columns" }, summary,
@@ -95,15 +97,16 @@ function saved(file, name) {
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 60000);
 }
-/* A figure as a file of its own, in black on white. */
-const standalone = svg => svg.outerHTML.replace(/var\(--\w+, (#\w+)\)/g, "$1");
+/* What makes a figure black on white, whatever the page is. */
+const light = text => text.replace(/var\(--\w+, (#\w+)\)/g, "$1");
 
 function savable(figure) {
   const svg = figure.querySelector("svg"), name = figure.dataset.name;
+  const standalone = () => light(new XMLSerializer().serializeToString(svg));
   const asSvg = made("button", { type: "button" }, "Save as SVG");
   const asPng = made("button", { type: "button" }, "Save as PNG");
   asSvg.addEventListener("click", () =>
-    saved(new Blob([standalone(svg)], { type: "image/svg+xml" }), `${name}.svg`));
+    saved(new Blob([standalone()], { type: "image/svg+xml" }), `${name}.svg`));
   asPng.addEventListener("click", () => {
     const image = new Image(), canvas = document.createElement("canvas");
     const { width, height } = svg.viewBox.baseVal, scale = 3;
@@ -112,7 +115,7 @@ function savable(figure) {
       canvas.getContext("2d").drawImage(image, 0, 0, canvas.width, canvas.height);
       canvas.toBlob(file => saved(file, `${name}.png`));
     });
-    image.src = `data:image/svg+xml,${encodeURIComponent(standalone(svg))}`;
+    image.src = `data:image/svg+xml,${encodeURIComponent(standalone())}`;
   });
   figure.append(made("div", { className: "save" }, asSvg, asPng));
 }
@@ -155,7 +158,7 @@ function watchable(figure) {
     });
     const picture = data.pictures[frame - data.first];
     for (const image of [whole, target]) if (image) image.style.display = picture ? "" : "none";
-    stages.style.setProperty("--truth", picture ? "#fff" : "initial");
+    stages.classList.toggle("bare", !picture);
     if (picture) {
       whole.setAttribute("href", `data:image/jpeg;base64,${picture[0]}`);
       target.setAttribute("href", picture[1] ? `data:image/jpeg;base64,${picture[1]}` : "");
@@ -167,7 +170,7 @@ function watchable(figure) {
       zoom.firstElementChild.setAttribute("viewBox",
         `${x + w / 2 - side / 2} ${y + h / 2 - side / 2} ${side} ${side}`);
     }
-    const left = (data.arrivals[frame] + .5) * 8;
+    const left = (data.arrivals[frame] + .5) * data.pixels;
     for (const cursor of figure.querySelectorAll(".cursor")) {
       cursor.setAttribute("x1", left);
       cursor.setAttribute("x2", left);
@@ -195,7 +198,7 @@ function watchable(figure) {
   }
   const at = (event, svg, width) => {
     const place = svg.getBoundingClientRect();
-    return frameAt(data.arrivals, (event.clientX - place.left) / place.width * width / 8);
+    return frameAt(data.arrivals, (event.clientX - place.left) / place.width * width / data.pixels);
   };
   slider.addEventListener("input", () => { stop(); go(Number(slider.value)); });
   strip.addEventListener("pointermove", event => { stop(); show(at(event, strip, length)); });
