@@ -18,7 +18,7 @@ and of which b = a (2 + r) / (2 - r) is the inverse.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,11 +109,11 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Past:
-    """The motion that led to each of N outputs.
+    """The motion that led to each of N outputs, a row for each of its numbers.
 
     Attributes:
         place: where the target is then, arrays [N].
-        velocity: see :meth:`Place.velocity`, [N, 4]; 0 for the first of a lane.
+        velocity: see :meth:`Place.velocity`, [4, N]; 0 for the first of a lane.
         interval: frames since the output before, [N]; 0 for the first of a lane.
         first: first item of each one's lane, int64 [N].
     """
@@ -126,32 +126,30 @@ class Past:
     @classmethod
     def of(cls, lanes: Lanes) -> Past:
         """The motion of some lanes."""
-        every = np.arange(len(lanes.frames))
-        first = lanes.first(every)
+        every, first = np.arange(len(lanes.frames)), lanes.firsts()
         before = np.maximum(every - 1, first)
         place = Place.of(*lanes.boxes.T)
         interval = (lanes.frames - lanes.frames[before]).astype(np.float64)
         since = np.where(interval > 0, interval, 1.0)
-        velocity = np.stack(place.velocity(place.chosen(before), since), axis=1)
-        velocity[interval <= 0] = 0.0
+        velocity = np.stack(place.velocity(place.chosen(before), since))
+        velocity[:, interval <= 0] = 0.0
         return cls(place, velocity, np.maximum(interval, 0.0), first)
 
     def window(self, item: Ints) -> Ints:
-        """The outputs whose motion is seen as of some items, [n, VELOCITIES + STARTS].
+        """The outputs whose motion is seen as of some items, [VELOCITIES + STARTS, n].
 
         They are the last ones, newest first, and the first ones of the lane. Where there is none it
         is the lane's first output, which nothing led to.
         """
-        start = self.first[item, None]
-        last = np.maximum(item[:, None] - np.arange(VELOCITIES), start)
-        opening = start + 1 + np.arange(STARTS)
-        return np.concatenate([last, np.where(opening <= item[:, None], opening, start)], axis=1)
+        start = self.first[item]
+        last = np.maximum(item - np.arange(VELOCITIES)[:, None], start)
+        opening = start + 1 + np.arange(STARTS)[:, None]
+        return np.concatenate([last, np.where(opening <= item, opening, start)])
 
 
 def rows_of(velocity: Floats, interval: Floats) -> Floats:
-    """What the network sees of velocities [..., 4] after intervals [...], [..., 6]."""
-    known = np.where(interval > 0, ONE, 0.0)
-    return np.stack([*_row(np.moveaxis(velocity, -1, 0), interval), known], axis=-1)
+    """What the network sees of velocities [4, ...] after intervals [...], [6, ...]."""
+    return np.stack([*_row(velocity, interval), np.where(interval > 0, ONE, 0.0)])
 
 
 def _row(velocity: Sequence[Number] | Floats, interval: Number) -> tuple[Number, ...]:
@@ -162,11 +160,11 @@ def _row(velocity: Sequence[Number] | Floats, interval: Number) -> tuple[Number,
 
 
 def mirrored(motion: Floats) -> Floats:
-    """By what to multiply x and y so that motions [n, VELOCITIES, 4] go right and down, [n, 2].
+    """By what to multiply x and y so that motions [VELOCITIES, 4, ...] go right and down, [2, ...].
 
     By 0 if they go neither way: of a mirrored world everything is mirrored, of one at rest too.
     """
-    return np.sign(_FADING @ motion[..., :2])
+    return np.sign(sum(part * each for part, each in zip(_FADING, motion[:, :2])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,33 +196,49 @@ class Learned:
     def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once, to the last bit."""
         past = Past.of(lanes)
-        rates, offsets = self._outlooks(past)
         ahead = (frame - lanes.frames[item]).astype(np.float64)
         boxes = lanes.boxes[item]
         asked = np.flatnonzero((ahead > 0) & (item > past.first[item]))  # else nothing has moved
-        which = item[asked]
-        moved = past.place.chosen(which).moved(
-            rates[which].transpose(1, 2, 0), offsets[which].T, ahead[asked]
-        )
-        boxes[asked] = np.stack(moved, axis=1)
+        item, ahead = item[asked], ahead[asked]
+        for part, outlook in self._outlooks(past):
+            some = slice(*np.searchsorted(item, [part.start, part.stop]))
+            which = item[some]
+            rates, offset = (each[..., which - part.start] for each in outlook)
+            moved = past.place.chosen(which).moved(rates, offset, ahead[some])
+            boxes[asked[some]] = np.stack(moved, axis=1)
         return boxes
 
-    def _outlooks(self, past: Past) -> tuple[Floats, Floats]:
-        """The rates [N, RATES, 4] and offsets [N, 4] after each item."""
-        rows, count = rows_of(past.velocity, past.interval), len(past.first)
-        every = np.arange(count)
-        shape = np.stack(past.place.shape((every - past.first).astype(np.float64)), axis=1)
-        rates, offsets = np.empty((count, RATES, 4)), np.empty((count, 4))
+    def _outlooks(self, past: Past) -> Iterator[tuple[slice, tuple[Floats, Floats]]]:
+        """The rates and offsets after each item, some items after others."""
+        count = len(past.first)
+        age = np.arange(count) - past.first
+        velocity, rows = _after_none(past.velocity), _after_none(rows_of(past.velocity, past.interval))
+        shape = np.stack(past.place.shape(age.astype(np.float64)))
         for begin in range(0, count, _PART):
-            item = every[begin : begin + _PART]
-            window = past.window(item)
-            motion = past.velocity[window[:, :VELOCITIES]]
+            part = slice(begin, min(begin + _PART, count))
+            motion = _latest(velocity, part, age[part])
             mirror = mirrored(motion)
-            seen = rows[window]
-            seen[..., :2] *= mirror[:, None]
-            inputs = np.concatenate([seen.reshape(len(item), -1), shape[item]], axis=1)
-            rates[item], offsets[item] = _outlook(self.network(inputs), motion, mirror)
-        return rates, offsets
+            inputs = np.empty((INPUTS, part.stop - begin))
+            seen = inputs[:-3].reshape(VELOCITIES + STARTS, _SEEN, -1)
+            seen[:VELOCITIES] = _latest(rows, part, age[part])
+            for k in range(STARTS):
+                seen[VELOCITIES + k] = rows[:, VELOCITIES - 1 + past.first[part] + np.where(age[part] > k, k + 1, 0)]
+            seen[:, :2] *= mirror
+            inputs[-3:] = shape[:, part]
+            yield part, _outlook(self.network(inputs), motion, mirror)
+
+
+def _after_none(rows):
+    return np.concatenate([np.zeros((len(rows), VELOCITIES - 1)), rows], axis=1)
+
+
+def _latest(rows, part, age):
+    n = len(age)
+    found = np.stack([rows[:, begin : begin + n] for begin in range(part.start + VELOCITIES - 1, part.start - 1, -1)])
+    early = np.flatnonzero(age < VELOCITIES - 1)
+    for k in range(1, VELOCITIES):
+        found[k][:, early[age[early] < k]] = 0.0
+    return found
 
 
 _FADING = 0.5 ** np.arange(VELOCITIES)
@@ -241,21 +255,20 @@ def _outlook(answers: Floats, motion: Floats, mirror: Floats) -> tuple[Floats, F
     """What the network's answers mean; all of it is exact.
 
     Args:
-        answers: of the network, [n, OUTPUTS].
-        motion: the last velocities, newest first, [n, VELOCITIES, 4].
-        mirror: by what x and y were multiplied, see :func:`mirrored`, [n, 2].
+        answers: of the network, [OUTPUTS, n].
+        motion: the last velocities, newest first, [VELOCITIES, 4, n].
+        mirror: by what x and y were multiplied, see :func:`mirrored`, [2, n].
 
     Returns:
-        Rates [n, RATES, 4] and offsets [n, 4] for :meth:`Place.moved`.
+        Rates [RATES, 4, n] and offsets [4, n] for :meth:`Place.moved`.
     """
-    answers = answers / ONE
-    weights = answers[:, :MIXING].reshape(-1, 2 * RATES, VELOCITIES)
-    mixed = weights @ motion
-    mixed[:, :RATES, 2:] = mixed[:, RATES:, 2:]
-    turned = np.ones((len(mirror), 4))
-    turned[:, :2] = mirror
-    more = CORRECTION * answers[:, MIXING:-4].reshape(-1, RATES, 4)
-    return mixed[:, :RATES] + more * turned[:, None], OFFSET * answers[:, -4:] * turned
+    n = answers.shape[1:]
+    weights = answers[:MIXING].reshape(2, RATES, VELOCITIES, *n)
+    mixed = np.einsum("srv...,vsc...->rsc...", weights, motion.reshape(VELOCITIES, 2, 2, *n)).reshape(RATES, 4, *n)
+    turned = np.ones((4, *n))
+    turned[:2] = mirror
+    more = CORRECTION * answers[MIXING:-4].reshape(RATES, 4, *n)
+    return (mixed + more * turned) / ONE, OFFSET / ONE * answers[-4:] * turned
 
 
 class _Following:
@@ -289,10 +302,10 @@ class _Following:
             inputs[at : at + _SEEN] = inputs[:_SEEN]
         inputs[-3:] = place.shape(float(self._count))
         self._box, self._frame, self._place = box, frame, place
-        mirror = mirrored(motion)
+        mirror = np.sign(_FADING.dot(motion[:, :2]))
         shown = inputs * _MIRRORS[int(mirror[0]), int(mirror[1])]
-        rates, offset = _outlook(self._network(shown[None]), motion[None], mirror[None])
-        self._rates, self._offset = rates[0].tolist(), offset[0].tolist()
+        rates, offset = _outlook(self._network(shown), motion, mirror)
+        self._rates, self._offset = rates.tolist(), offset.tolist()
 
     def predict(self, frame: int) -> Sequence[float]:
         """The box at a frame, from the boxes so far."""
