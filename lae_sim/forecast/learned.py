@@ -203,7 +203,10 @@ class Learned:
         for part, outlook in self._outlooks(past):
             some = slice(*np.searchsorted(item, [part.start, part.stop]))
             which = item[some]
-            rates, offset = (each[..., which - part.start] for each in outlook)
+            rates, offset = outlook
+            at = which - part.start
+            rates = [[each[at] for each in row] for row in rates]
+            offset = [each[at] for each in offset]
             moved = past.place.chosen(which).moved(rates, offset, ahead[some])
             boxes[asked[some]] = np.stack(moved, axis=1)
         return boxes
@@ -225,7 +228,12 @@ class Learned:
                 seen[VELOCITIES + k] = rows[:, VELOCITIES - 1 + past.first[part] + np.where(age[part] > k, k + 1, 0)]
             seen[:, :2] *= mirror
             inputs[-3:] = shape[:, part]
-            yield part, _outlook(self.network(inputs), motion, mirror)
+            answers = self.network(inputs)
+            weights = answers[:MIXING].reshape(2, RATES, VELOCITIES, -1)
+            mixed = np.einsum(
+                "srvn,vscn->rscn", weights, motion.reshape(VELOCITIES, 2, 2, -1)
+            ).reshape(RATES, 4, -1)
+            yield part, _outlook(mixed, answers[MIXING:], mirror)
 
 
 def _after_none(rows):
@@ -251,24 +259,26 @@ for _factor in (0, -1):
     _MIRRORS[:, _factor, 1:-3:_SEEN] = _factor
 
 
-def _outlook(answers: Floats, motion: Floats, mirror: Floats) -> tuple[Floats, Floats]:
-    """What the network's answers mean; all of it is exact.
+def _outlook(
+    mixed: Any, more: Any, mirror: Sequence[Number] | Floats
+) -> tuple[list[list[Number]], list[Number]]:
+    """What the network's answers mean, in numbers or arrays; all of it is exact.
 
     Args:
-        answers: of the network, [OUTPUTS, n].
-        motion: the last velocities, newest first, [VELOCITIES, 4, n].
-        mirror: by what x and y were multiplied, see :func:`mirrored`, [2, n].
+        mixed: sums of velocities by the network's weights, [RATES][4]; ``ONE`` is 1.
+        more: its other answers, corrections of these and offsets, [4 * RATES + 4]; ``ONE`` is 1.
+        mirror: by what x and y were multiplied, see :func:`mirrored`, [2].
 
     Returns:
-        Rates [RATES, 4, n] and offsets [4, n] for :meth:`Place.moved`.
+        Rates [RATES][4] and offsets [4] for :meth:`Place.moved`.
     """
-    n = answers.shape[1:]
-    weights = answers[:MIXING].reshape(2, RATES, VELOCITIES, *n)
-    mixed = np.einsum("srv...,vsc...->rsc...", weights, motion.reshape(VELOCITIES, 2, 2, *n)).reshape(RATES, 4, *n)
-    turned = np.ones((4, *n))
-    turned[:2] = mirror
-    more = CORRECTION * answers[MIXING:-4].reshape(RATES, 4, *n)
-    return (mixed + more * turned) / ONE, OFFSET / ONE * answers[-4:] * turned
+    x, y = mirror
+    more = [each * turn for each, turn in zip(more, [x, y, 1.0, 1.0] * (RATES + 1))]
+    rates = [
+        [mix / ONE + CORRECTION / ONE * each for mix, each in zip(row, more[4 * k :])]
+        for k, row in enumerate(mixed)
+    ]
+    return rates, [OFFSET / ONE * each for each in more[-4:]]
 
 
 class _Following:
@@ -289,8 +299,8 @@ class _Following:
         """Take in the box of a newer frame."""
         place, interval = Place.of(*map(float, box)), float(frame - self._frame)
         inputs, motion, seen_last = self._inputs, self._motion, _SEEN * VELOCITIES
-        inputs[_SEEN:seen_last] = inputs[: seen_last - _SEEN].copy()
-        motion[1:] = motion[:-1].copy()
+        inputs[_SEEN:seen_last] = inputs[: seen_last - _SEEN]
+        motion[1:] = motion[:-1]
         inputs[:_SEEN], motion[0] = 0.0, 0.0
         if interval > 0:
             velocity = place.velocity(self._place, interval)
@@ -302,10 +312,12 @@ class _Following:
             inputs[at : at + _SEEN] = inputs[:_SEEN]
         inputs[-3:] = place.shape(float(self._count))
         self._box, self._frame, self._place = box, frame, place
-        mirror = np.sign(_FADING.dot(motion[:, :2]))
-        shown = inputs * _MIRRORS[int(mirror[0]), int(mirror[1])]
-        rates, offset = _outlook(self._network(shown), motion, mirror)
-        self._rates, self._offset = rates.tolist(), offset.tolist()
+        x, y, _, _ = _FADING.dot(motion).tolist()
+        mirror = (x > 0) - (x < 0), (y > 0) - (y < 0)
+        answers = self._network(inputs * _MIRRORS[mirror])
+        mixed = answers[:MIXING].reshape(2 * RATES, VELOCITIES).dot(motion).tolist()
+        mixed = [[*row[:2], *other[2:]] for row, other in zip(mixed, mixed[RATES:])]
+        self._rates, self._offset = _outlook(mixed, answers[MIXING:].tolist(), mirror)
 
     def predict(self, frame: int) -> Sequence[float]:
         """The box at a frame, from the boxes so far."""
