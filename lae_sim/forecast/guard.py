@@ -36,6 +36,7 @@ _WORSE, _BETTER = 1.5, 1.1
 # Of the errors, in target sizes, that count for nothing: of x, y, w and h.
 _SLACK = (0.004, 0.004, 0.1, 0.1)
 _MOST = 1.0  # a single error counts for no more, such as that of a jump
+_PART = 1 << 11  # items at once: what is computed on the way stays in the cache
 _FEWEST = 2  # outputs before one can be judged: with the initial box alone every forecast is that
 
 
@@ -112,17 +113,24 @@ class Guarded:
         """
         order, running = lanes.in_step()
         ends = np.cumsum(running)
-        boxes = lanes.boxes[order].T
-        errors = np.stack([_errors(each[order].T, boxes) for each in (said, latest)])
-        means = _share(errors)  # [2, 4, N], to which those of the steps before are added
-        means[..., : ends[:_FEWEST].max(initial=0)] = 0.0
-        steps = [
+        steps = [  # each with the places of its lanes in the step before
             (slice(end - n, end), slice(end - n - last, end - last))
-            for last, n, end in zip(*(each.tolist() for each in (running[_FEWEST-1:], running[_FEWEST:], ends[_FEWEST:])))
+            for last, n, end in zip(
+                running[_FEWEST - 1 :].tolist(),
+                running[_FEWEST:].tolist(),
+                ends[_FEWEST:].tolist(),
+            )
         ]
+        means = np.empty((4, 2, len(order)))  # the base's and hold's, in time-major order
+        for begin in range(0, len(order), _PART):
+            some = order[begin : begin + _PART]
+            both = np.stack([said[some].T, latest[some].T], axis=1)
+            means[..., begin : begin + _PART] = _errors(both, lanes.boxes[some].T)
+        means = _share(means)  # to which those of the steps before are added
+        means[..., : ends[:_FEWEST].max(initial=0)] = 0.0
         for now, before in steps:
             means[..., now] += _KEPT * means[..., before]
-        own, holds = means
+        own, holds = means[:, 0], means[:, 1]
         slack = np.array(_SLACK)[:, None]
         held = own > _WORSE * holds + slack
         still = own > _BETTER * holds + 0.5 * slack

@@ -50,7 +50,7 @@ MIXING = 2 * RATES * VELOCITIES
 OUTPUTS = MIXING + 4 * RATES + 4
 _FINE = 2.0**20  # velocities are multiples of its inverse, so that sums of them are exact
 _FASTEST = 8.0
-_PART = 1 << 12  # items at once: windows take much memory, and small ones stay in the cache
+_PART = 1024
 
 
 @dataclass(frozen=True)
@@ -136,15 +136,15 @@ class Past:
         return cls(place, velocity, np.maximum(interval, 0.0), first)
 
     def window(self, item: Ints) -> Ints:
-        """The outputs whose motion is seen as of some items, [VELOCITIES + STARTS, n].
+        """The outputs whose motion is seen as of some items, [n, VELOCITIES + STARTS].
 
         They are the last ones, newest first, and the first ones of the lane. Where there is none it
         is the lane's first output, which nothing led to.
         """
-        start = self.first[item]
-        last = np.maximum(item - np.arange(VELOCITIES)[:, None], start)
-        opening = start + 1 + np.arange(STARTS)[:, None]
-        return np.concatenate([last, np.where(opening <= item, opening, start)])
+        start = self.first[item, None]
+        last = np.maximum(item[:, None] - np.arange(VELOCITIES), start)
+        opening = start + 1 + np.arange(STARTS)
+        return np.concatenate([last, np.where(opening <= item[:, None], opening, start)], axis=1)
 
 
 def rows_of(velocity: Floats, interval: Floats) -> Floats:
@@ -200,53 +200,79 @@ class Learned:
         boxes = lanes.boxes[item]
         asked = np.flatnonzero((ahead > 0) & (item > past.first[item]))  # else nothing has moved
         item, ahead = item[asked], ahead[asked]
-        for part, outlook in self._outlooks(past):
+        for part, rates, offset in self._outlooks(past):
             some = slice(*np.searchsorted(item, [part.start, part.stop]))
-            which = item[some]
-            rates, offset = outlook
-            at = which - part.start
-            rates = [[each[at] for each in row] for row in rates]
-            offset = [each[at] for each in offset]
-            moved = past.place.chosen(which).moved(rates, offset, ahead[some])
+            place, at = past.place.chosen(item[some]), item[some] - part.start
+            moved = place.moved(
+                [[each[at] for each in row] for row in rates],
+                [each[at] for each in offset],
+                ahead[some],
+            )
             boxes[asked[some]] = np.stack(moved, axis=1)
         return boxes
 
-    def _outlooks(self, past: Past) -> Iterator[tuple[slice, tuple[Floats, Floats]]]:
-        """The rates and offsets after each item, some items after others."""
+    def _outlooks(self, past: Past) -> Iterator[tuple[slice, list[list[Floats]], list[Floats]]]:
+        """The rates and offsets after each item of a part of them, one part after another."""
         count = len(past.first)
         age = np.arange(count) - past.first
-        velocity, rows = _after_none(past.velocity), _after_none(rows_of(past.velocity, past.interval))
+        velocity = _led(past.velocity)
+        rows = _led(rows_of(past.velocity, past.interval))
         shape = np.stack(past.place.shape(age.astype(np.float64)))
+        motions, sights = np.empty((VELOCITIES, 4, _PART)), np.empty((INPUTS, _PART))
+        windows = sights[:-3].reshape(VELOCITIES + STARTS, _SEEN, _PART)
         for begin in range(0, count, _PART):
             part = slice(begin, min(begin + _PART, count))
-            motion = _latest(velocity, part, age[part])
+            n, old = part.stop - begin, age[part]
+            motion, inputs, seen = motions[..., :n], sights[:, :n], windows[..., :n]
+            _lag(velocity, begin, old, motion)
+            _lag(rows, begin, old, seen[:VELOCITIES])
+            first = past.first[part] + _LEAD
+            for k in range(1, STARTS + 1):
+                opening = np.where(old >= k, first + k, first)
+                seen[VELOCITIES + k - 1] = rows.take(opening, axis=1)
             mirror = mirrored(motion)
-            inputs = np.empty((INPUTS, part.stop - begin))
-            seen = inputs[:-3].reshape(VELOCITIES + STARTS, _SEEN, -1)
-            seen[:VELOCITIES] = _latest(rows, part, age[part])
-            for k in range(STARTS):
-                seen[VELOCITIES + k] = rows[:, VELOCITIES - 1 + past.first[part] + np.where(age[part] > k, k + 1, 0)]
             seen[:, :2] *= mirror
             inputs[-3:] = shape[:, part]
             answers = self.network(inputs)
-            weights = answers[:MIXING].reshape(2, RATES, VELOCITIES, -1)
             mixed = np.einsum(
-                "srvn,vscn->rscn", weights, motion.reshape(VELOCITIES, 2, 2, -1)
-            ).reshape(RATES, 4, -1)
-            yield part, _outlook(mixed, answers[MIXING:], mirror)
+                "srvn,vscn->rscn",
+                answers[:MIXING].reshape(2, RATES, VELOCITIES, n),
+                motion.reshape(VELOCITIES, 2, 2, n),
+            ).reshape(RATES, 4, n)
+            yield part, *_outlook(mixed, answers[MIXING:], mirror)
 
 
-def _after_none(rows):
-    return np.concatenate([np.zeros((len(rows), VELOCITIES - 1)), rows], axis=1)
+_LEAD = VELOCITIES - 1
 
 
-def _latest(rows, part, age):
-    n = len(age)
-    found = np.stack([rows[:, begin : begin + n] for begin in range(part.start + VELOCITIES - 1, part.start - 1, -1)])
-    early = np.flatnonzero(age < VELOCITIES - 1)
-    for k in range(1, VELOCITIES):
-        found[k][:, early[age[early] < k]] = 0.0
-    return found
+def _led(rows: Floats) -> Floats:
+    """Rows [k, N] after as many columns of zeros as a window may reach back before the first."""
+    return np.concatenate([np.zeros((len(rows), _LEAD)), rows], axis=1)
+
+
+def _lag(rows: Floats, begin: int, age: Ints, out: Floats) -> None:
+    """Write the columns of the last outputs as of each of some items, newest first.
+
+    They are slices of the rows, which takes far less time than to gather them. Where a lane has
+    none so old, as of its first items, there are zeros. Two lanes, a and b, and their windows:
+
+        rows        a0 a1 a2 b0 b1 b2
+        out[0]      a0 a1 a2 b0 b1 b2
+        out[1]      .  a0 a1 .  b0 b1
+        out[2]      .  .  a0 .  .  b0
+
+    Args:
+        rows: of all items, [k, _LEAD + N]; see :func:`_led`.
+        begin: the first of the items.
+        age: items before each of them in its lane, int64 [n].
+        out: [VELOCITIES, k, n].
+    """
+    early = np.flatnonzero(age < _LEAD)
+    reach = age[early]
+    for k, columns in enumerate(out):
+        last = begin + _LEAD - k
+        columns[:] = rows[:, last : last + len(age)]
+        columns[:, early[reach < k]] = 0.0
 
 
 _FADING = 0.5 ** np.arange(VELOCITIES)
@@ -312,7 +338,7 @@ class _Following:
             inputs[at : at + _SEEN] = inputs[:_SEEN]
         inputs[-3:] = place.shape(float(self._count))
         self._box, self._frame, self._place = box, frame, place
-        x, y, _, _ = _FADING.dot(motion).tolist()
+        x, y = _FADING.dot(motion).tolist()[:2]
         mirror = (x > 0) - (x < 0), (y > 0) - (y < 0)
         answers = self._network(inputs * _MIRRORS[mirror])
         mixed = answers[:MIXING].reshape(2 * RATES, VELOCITIES).dot(motion).tolist()

@@ -37,7 +37,7 @@ _MOST_INPUTS = 256  # 2**(15 + 20 + 8) is exact, and so are sums of outputs time
 
 # Columns at once: they stay in the cache, and BLAS does not spread so few over threads, which take
 # longer to wait for than to do without.
-_BLOCK = 256
+_BLOCK = 192
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +104,11 @@ class Network:
         """
         if inputs.ndim == 1:
             return self._answers(inputs)
-        blocks = range(0, inputs.shape[1], _BLOCK)
-        return np.concatenate(
-            [self._answers(inputs[:, begin : begin + _BLOCK]) for begin in blocks], axis=1
-        )
+        answers = np.empty((self.outputs, inputs.shape[1]))
+        for begin in range(0, inputs.shape[1], _BLOCK):
+            block = slice(begin, begin + _BLOCK)
+            answers[:, block] = self._answers(inputs[:, block])
+        return answers
 
     def _answers(self, found: Floats) -> Floats:
         for weight, bias, least in self._layers:
