@@ -95,7 +95,7 @@ class Guarded:
         frames = np.concatenate([frame, lanes.frames])
         answers[order] = forecast(self.base, lanes, both[order], frames[order])
         boxes, said = answers[: len(item)], answers[len(item) :]
-        held = self._held(lanes, said, lanes.boxes[before])[:, item]
+        held = self._held(lanes, said, lanes.boxes.take(before, axis=0)).take(item, axis=1)
         some = held.any(axis=0)
         boxes[some] = np.stack(
             _mixed(boxes[some].T, lanes.boxes[item[some]].T, held[:, some]), axis=1
@@ -121,12 +121,15 @@ class Guarded:
                 ends[_FEWEST:].tolist(),
             )
         ]
-        means = np.empty((4, 2, len(order)))  # the base's and hold's, in time-major order
+        means = np.empty((4, 2, len(order)))  # of the base and of hold, in time-major order
         for begin in range(0, len(order), _PART):
-            some = order[begin : begin + _PART]
-            both = np.stack([said[some].T, latest[some].T], axis=1)
-            means[..., begin : begin + _PART] = _errors(both, lanes.boxes[some].T)
-        means = _share(means)  # to which those of the steps before are added
+            part = slice(begin, begin + _PART)
+            base, hold, box = (
+                each.take(order[part], axis=0).T for each in (said, latest, lanes.boxes)
+            )
+            errors = _errors(np.stack([base, hold], axis=1), np.ascontiguousarray(box))
+            for mean, error in zip(means, errors):
+                mean[:, part] = _share(error)  # to which that of the steps before is added
         means[..., : ends[:_FEWEST].max(initial=0)] = 0.0
         for now, before in steps:
             means[..., now] += _KEPT * means[..., before]
@@ -136,7 +139,7 @@ class Guarded:
         still = own > _BETTER * holds + 0.5 * slack
         for now, before in steps:
             held[:, now] |= held[:, before] & still[:, now]
-        by_item = np.empty_like(held)
+        by_item: Bools = np.empty_like(held)
         by_item[:, order] = held
         return by_item
 

@@ -71,7 +71,7 @@ class Place:
 
     def chosen(self, which: Ints) -> Place:
         """Some of the places."""
-        return Place(*(each[which] for each in (self.x, self.y, self.w, self.h, self.size)))
+        return Place(*(each.take(which) for each in (self.x, self.y, self.w, self.h, self.size)))
 
     def velocity(self, before: Place, interval: Number) -> tuple[Number, ...]:
         """Of the centre in sizes per frame, of the sides as ratios per frame, after an interval."""
@@ -164,7 +164,8 @@ def mirrored(motion: Floats) -> Floats:
 
     By 0 if they go neither way: of a mirrored world everything is mirrored, of one at rest too.
     """
-    return np.sign(sum(part * each for part, each in zip(_FADING, motion[:, :2])))
+    signs: Floats = np.sign(sum(part * each for part, each in zip(_FADING, motion[:, :2])))
+    return signs
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,15 +198,15 @@ class Learned:
         """The same for many lanes at once, to the last bit."""
         past = Past.of(lanes)
         ahead = (frame - lanes.frames[item]).astype(np.float64)
-        boxes = lanes.boxes[item]
+        boxes: Floats = lanes.boxes.take(item, axis=0)
         asked = np.flatnonzero((ahead > 0) & (item > past.first[item]))  # else nothing has moved
         item, ahead = item[asked], ahead[asked]
         for part, rates, offset in self._outlooks(past):
             some = slice(*np.searchsorted(item, [part.start, part.stop]))
             place, at = past.place.chosen(item[some]), item[some] - part.start
             moved = place.moved(
-                [[each[at] for each in row] for row in rates],
-                [each[at] for each in offset],
+                [[each.take(at) for each in row] for row in rates],
+                [each.take(at) for each in offset],
                 ahead[some],
             )
             boxes[asked[some]] = np.stack(moved, axis=1)
