@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import subprocess
 import sys
 from dataclasses import replace
 from fractions import Fraction
@@ -219,6 +220,35 @@ def test_answers_are_the_same_bits_for_any_number_of_lanes(
         if k == 0:
             streamed = streaming(LEARNED, one, alone, one.frames + 3)
             assert streamed.tobytes() == found[k].tobytes()
+
+
+WANDERING = """
+import numpy as np
+from lae_sim.forecast.base import Lanes, forecast
+from lae_sim.forecast.learned import shipped
+
+rng, length = np.random.default_rng(6), 30
+boxes = np.cumsum(rng.normal(0, 3, (40, length, 4)), axis=1) + [300, 200, 60, 40]
+frames, item = np.tile(np.arange(length) * 2, 40), np.arange(40 * length)
+lanes = Lanes(np.arange(41) * length, frames, boxes.reshape(-1, 4), np.full((40, 2), np.inf))
+answer = forecast(shipped(), lanes, item, frames + 3).tobytes().hex()
+"""
+
+
+@pytest.mark.parametrize(("kernel", "threads"), [("Nehalem", "1"), ("Haswell", "3")])
+def test_answers_are_the_same_bits_whatever_blas_computes_with(kernel: str, threads: str) -> None:
+    """As on other processors, for which OpenBLAS has other kernels, with sums in other orders."""
+    here: dict[str, Any] = {}
+    exec(WANDERING, here)
+    settings = {"OPENBLAS_CORETYPE": kernel, "OPENBLAS_NUM_THREADS": threads}
+    there = subprocess.run(
+        [sys.executable, "-c", WANDERING + "print(answer)"],
+        env={**os.environ, **settings},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert there.stdout.strip() == here["answer"]
 
 
 # -------------------------------------------------------------------------------------- symmetries
