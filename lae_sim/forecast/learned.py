@@ -8,9 +8,11 @@ regression on past motion is PVT++'s idea (Li et al., "PVT++: A Simple End-to-En
 Visual Tracking Framework", ICCV 2023, Sec. 4); weights over velocities, and training on the overlap
 and on made-up motion, are new here.
 
-Answers are the same bits for one sequence and for thousands, on every processor: the network
-counts in whole numbers (:mod:`lae_sim.forecast.network`), and all else is addition, multiplication,
-division, square roots and rounding, which IEEE 754 defines to the last bit, in one order.
+Answers are the same bits for one sequence and for thousands, on every processor, so that no
+tolerance is needed: the network counts in whole numbers (:mod:`lae_sim.forecast.network`) and sums
+of velocities are of multiples of 2**-20, both exact in any order, whatever BLAS and its threads do;
+all else is addition, multiplication, division, square roots and rounding, which IEEE 754 defines to
+the last bit, number by number in one order.
 Logarithms are not defined so: sizes change by r = 2 (b - a) / (b + a), which is about log(b / a),
 and of which b = a (2 + r) / (2 - r) is the inverse.
 """
@@ -159,6 +161,39 @@ def _row(velocity: Sequence[Number] | Floats, interval: Number) -> tuple[Number,
     return *(nearest(each * ONE) for each in bent), nearest(interval / (interval + 4.0) * ONE)
 
 
+_LEAD = VELOCITIES - 1  # columns of zeros before the first item, to which windows may reach back
+
+
+def _led(rows: Floats) -> Floats:
+    """Rows [k, N] after the leading zeros, [k, _LEAD + N]."""
+    return np.concatenate([np.zeros((len(rows), _LEAD)), rows], axis=1)
+
+
+def _lag(rows: Floats, begin: int, age: Ints, out: Floats) -> None:
+    """Write the columns of the last outputs as of each of some items, newest first.
+
+    They are slices of the rows, which takes far less time than to gather them. Where a lane has
+    none so old, as of its first items, there are zeros. Two lanes, a and b, and their windows:
+
+        rows        a0 a1 a2 b0 b1 b2
+        out[0]      a0 a1 a2 b0 b1 b2
+        out[1]      .  a0 a1 .  b0 b1
+        out[2]      .  .  a0 .  .  b0
+
+    Args:
+        rows: of all items, [k, _LEAD + N]; see :func:`_led`.
+        begin: the first of the items.
+        age: items before each of them in its lane, int64 [n].
+        out: [VELOCITIES, k, n].
+    """
+    early = np.flatnonzero(age < _LEAD)
+    reach = age[early]
+    for k, columns in enumerate(out):
+        last = begin + _LEAD - k
+        columns[:] = rows[:, last : last + len(age)]
+        columns[:, early[reach < k]] = 0.0
+
+
 def mirrored(motion: Floats) -> Floats:
     """By what to multiply x and y so that motions [VELOCITIES, 4, ...] go right and down, [2, ...].
 
@@ -227,10 +262,9 @@ class Learned:
             motion, inputs, seen = motions[..., :n], sights[:, :n], windows[..., :n]
             _lag(velocity, begin, old, motion)
             _lag(rows, begin, old, seen[:VELOCITIES])
-            first = past.first[part] + _LEAD
-            for k in range(1, STARTS + 1):
-                opening = np.where(old >= k, first + k, first)
-                seen[VELOCITIES + k - 1] = rows.take(opening, axis=1)
+            for k in range(STARTS):
+                opening = past.first[part] + np.where(old > k, k + 1, 0)
+                seen[VELOCITIES + k] = rows.take(_LEAD + opening, axis=1)
             mirror = mirrored(motion)
             seen[:, :2] *= mirror
             inputs[-3:] = shape[:, part]
@@ -241,39 +275,6 @@ class Learned:
                 motion.reshape(VELOCITIES, 2, 2, n),
             ).reshape(RATES, 4, n)
             yield part, *_outlook(mixed, answers[MIXING:], mirror)
-
-
-_LEAD = VELOCITIES - 1
-
-
-def _led(rows: Floats) -> Floats:
-    """Rows [k, N] after as many columns of zeros as a window may reach back before the first."""
-    return np.concatenate([np.zeros((len(rows), _LEAD)), rows], axis=1)
-
-
-def _lag(rows: Floats, begin: int, age: Ints, out: Floats) -> None:
-    """Write the columns of the last outputs as of each of some items, newest first.
-
-    They are slices of the rows, which takes far less time than to gather them. Where a lane has
-    none so old, as of its first items, there are zeros. Two lanes, a and b, and their windows:
-
-        rows        a0 a1 a2 b0 b1 b2
-        out[0]      a0 a1 a2 b0 b1 b2
-        out[1]      .  a0 a1 .  b0 b1
-        out[2]      .  .  a0 .  .  b0
-
-    Args:
-        rows: of all items, [k, _LEAD + N]; see :func:`_led`.
-        begin: the first of the items.
-        age: items before each of them in its lane, int64 [n].
-        out: [VELOCITIES, k, n].
-    """
-    early = np.flatnonzero(age < _LEAD)
-    reach = age[early]
-    for k, columns in enumerate(out):
-        last = begin + _LEAD - k
-        columns[:] = rows[:, last : last + len(age)]
-        columns[:, early[reach < k]] = 0.0
 
 
 _FADING = 0.5 ** np.arange(VELOCITIES)
@@ -309,7 +310,7 @@ def _outlook(
 
 
 class _Following:
-    """The streaming form, with one row of the arrays above."""
+    """The streaming form, with one column of the arrays above."""
 
     def __init__(self, network: Network, box: Sequence[float]) -> None:
         self._network = network
