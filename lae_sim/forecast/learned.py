@@ -169,29 +169,25 @@ def _led(rows: Floats) -> Floats:
     return np.concatenate([np.zeros((len(rows), _LEAD)), rows], axis=1)
 
 
-def _lag(rows: Floats, begin: int, age: Ints, out: Floats) -> None:
+def _lag(rows: Floats, begin: int, out: Floats) -> None:
     """Write the columns of the last outputs as of each of some items, newest first.
 
-    They are slices of the rows, which takes far less time than to gather them. Where a lane has
-    none so old, as of its first items, there are zeros. Two lanes, a and b, and their windows:
+    They are slices of the rows, which takes far less time than to gather them. As of a lane's first
+    items some are of the lane before; there is nothing then. Two lanes, a and b:
 
         rows        a0 a1 a2 b0 b1 b2
         out[0]      a0 a1 a2 b0 b1 b2
-        out[1]      .  a0 a1 .  b0 b1
-        out[2]      .  .  a0 .  .  b0
+        out[1]      .  a0 a1 a2 b0 b1       a2: nothing
+        out[2]      .  .  a0 a1 a2 b0       a1, a2: nothing
 
     Args:
         rows: of all items, [k, _LEAD + N]; see :func:`_led`.
         begin: the first of the items.
-        age: items before each of them in its lane, int64 [n].
         out: [VELOCITIES, k, n].
     """
-    early = np.flatnonzero(age < _LEAD)
-    reach = age[early]
     for k, columns in enumerate(out):
         last = begin + _LEAD - k
-        columns[:] = rows[:, last : last + len(age)]
-        columns[:, early[reach < k]] = 0.0
+        columns[:] = rows[:, last : last + columns.shape[1]]
 
 
 def mirrored(motion: Floats) -> Floats:
@@ -260,8 +256,10 @@ class Learned:
             part = slice(begin, min(begin + _PART, count))
             n, old = part.stop - begin, age[part]
             motion, inputs, seen = motions[..., :n], sights[:, :n], windows[..., :n]
-            _lag(velocity, begin, old, motion)
-            _lag(rows, begin, old, seen[:VELOCITIES])
+            none, at = np.nonzero(old < np.arange(VELOCITIES)[:, None])
+            for last, out in ((velocity, motion), (rows, seen[:VELOCITIES])):
+                _lag(last, begin, out)
+                out[none, :, at] = 0.0
             for k in range(STARTS):
                 opening = past.first[part] + np.where(old > k, k + 1, 0)
                 seen[VELOCITIES + k] = rows.take(_LEAD + opening, axis=1)
