@@ -1,7 +1,7 @@
-"""Traces of public results by name: recipes that say where the files lie and what their digests are.
+"""Traces of public results by name.
 
-Nothing of others is in the package: a recipe names files of public repositories at fixed commits.
-They are downloaded, checked and converted where a trace is asked for.
+A recipe names files of public repositories at fixed commits, and their digests. None of them is in
+the package: they are downloaded, checked and converted where a trace is asked for.
 """
 
 from lae_sim._faces import lazy_face

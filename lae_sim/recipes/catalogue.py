@@ -1,13 +1,13 @@
 """The recipes: which files of which public repositories make which trace.
 
-They are data. ``repositories.toml`` names the repositories, each at one commit; ``<dataset>.toml``
-says where a dataset's ground truth lies, and the results of which trackers on it; the files' digests
-are in ``digests/<repository>.txt``, of three kinds of lines::
+They are data. ``repositories.toml`` names the repositories, each at one commit. ``<dataset>.toml``
+says where a dataset's ground truth lies, and the results of which trackers on it. What files there
+are, and their digests, is in ``digests/<repository>.txt``, whose lines are::
 
-    # what begins so is not read
-    results/OTB2015/kcf/                           the folder of the lines that follow
-    3f0a...c2 15312 Basketball.txt                 SHA-256, bytes, path in the folder
-    77b1...09 8031 basketball.txt Basketball.txt   and what it is to be called here
+    # a comment
+    anno/                                          the folder of the lines that follow
+    3f0a...c2 15312 Biker.txt                      SHA-256, bytes, name
+    77b1...09 8031 basketball.txt Basketball.txt   and what it is called here
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ class Source:
         Raises:
             LaeError: if none does.
         """
-        folder = f"{repository.root}/{path.rpartition('/')[0]}/"
         within = f"{repository.root}/{path}"
+        folder = within[: within.rindex("/") + 1]
         found = tuple(
             replace(file, name=file.name.removeprefix(folder))
             for file in files
@@ -115,16 +115,14 @@ class Source:
             raise LaeError(f"{repository.url}: no digests of {path}")
         return cls(repository, path, inside, found)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, str]:
         """What a trace's metadata says of it."""
-        where = self.repository
-        path = self.path + (f"#{self.inside}" if self.inside else "")
         return {
-            "repository": where.url,
-            "commit": where.commit,
-            "path": path,
-            "licence": where.licence,
-            "citation": where.citation,
+            "repository": self.repository.url,
+            "commit": self.repository.commit,
+            "path": self.path,
+            **({"inside": self.inside} if self.inside else {}),
+            "licence": self.repository.licence,
         }
 
 
@@ -170,6 +168,12 @@ class Recipe:
         """What the trace is called if nothing else is said."""
         return f"{self.name.replace('/', '-')}.parquet"
 
+    @property
+    def citations(self) -> list[str]:
+        """What those who use the trace should cite."""
+        asked = (self.boxes.repository.citation, self.truth.repository.citation, self.citation)
+        return list(dict.fromkeys(asked))
+
     def document(self) -> dict[str, Any]:
         """The recipe as JSON values."""
         return {
@@ -192,8 +196,9 @@ class Recipe:
         """What a trace's metadata says of where it is from."""
         return {
             "recipe": self.name,
+            "cite": self.citations,
             "boxes": self.boxes.document(),
-            "truth": {**self.truth.document(), "dataset": self.citation},
+            "truth": self.truth.document(),
         }
 
 

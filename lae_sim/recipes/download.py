@@ -6,17 +6,17 @@ second one needs no network. A file appears in the cache when it is whole and it
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-from lae_sim.errors import LaeError, one_line
+from lae_sim.errors import LaeError, described, one_line
 from lae_sim.recipes.catalogue import RemoteFile
 
 HOME = "https://raw.githubusercontent.com/"
@@ -44,7 +44,7 @@ def cache_folder() -> Path:
 
 def download(
     files: Iterable[RemoteFile],
-    mirror: str | None = None,
+    mirror: str | os.PathLike[str] | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Path:
     """Bring files into the cache.
@@ -63,27 +63,29 @@ def download(
             written. What has arrived whole stays, and is not fetched again.
     """
     import pooch
+    import requests
 
     pooch.get_logger().setLevel("ERROR")  # or it would say each file on the standard error stream
     files = list({file.path: file for file in files}.values())
-    base = HOME if mirror is None else mirror
+    base = HOME if mirror is None else os.fspath(mirror)
     is_folder = "://" not in base
-    if is_folder and not Path(base).is_dir():
+    if is_folder and not os.path.isdir(base):
         raise LaeError(f"--mirror {base}: no such folder")
-    shelf = pooch.create(
-        cache_folder(),
-        base if base.endswith("/") else f"{base}/",
+    shelf = pooch.Pooch(
+        path=cache_folder(),
+        base_url=base if base.endswith("/") else f"{base}/",
         registry={file.path: f"sha256:{file.sha256}" for file in files},
     )
     count = _Count(sum(file.size for file in files), progress)
     pool = ThreadPoolExecutor(_AT_ONCE)
-    fetch = _copied if is_folder else _over_http
-    try:
-        pending = [pool.submit(_fetch, shelf, file, fetch, count) for file in files]
-        for each in as_completed(pending):
-            each.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with requests.Session() as session:
+        fetch = _copied if is_folder else partial(_over_http, session)
+        try:
+            pending = [pool.submit(_shelve, shelf, _Transfer(file, fetch, count)) for file in files]
+            for each in as_completed(pending):
+                each.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
     return Path(shelf.abspath)
 
 
@@ -101,102 +103,122 @@ class _Count:
     def add(self, size: int) -> None:
         with self._lock:
             self._done += size
-            self._progress(min(self._done, self._total), self._total)
+            self._progress(self._done, self._total)
 
 
-class _Counted:
-    """A file that counts what is written to it."""
+class _Transfer:
+    """What brings one file, as pooch calls it; it is also the stream that counts what comes.
 
-    def __init__(self, file: BinaryIO, count: _Count) -> None:
-        self._file, self._count, self.size = file, count, 0
+    Args:
+        file: what is to come.
+        fetch: writes what lies at an URL to a stream.
+        count: of all files.
 
-    def write(self, data: bytes) -> None:
-        self._file.write(data)
-        self.size += len(data)
-        self._count.add(len(data))
+    Attributes:
+        file: the same.
+        written: bytes of it that have come.
+    """
 
-    def flush(self) -> None:
-        """Leave it to the file, which knows when it is full."""
+    def __init__(
+        self, file: RemoteFile, fetch: Callable[[str, _Transfer], object], count: _Count
+    ) -> None:
+        self.file, self.written = file, 0
+        self._fetch, self._count = fetch, count
+        self._output: Any = None
 
-
-def _over_http(url: str, output: _Counted) -> None:
-    import pooch
-
-    pooch.HTTPDownloader(chunk_size=_CHUNK, timeout=_TIMEOUT_S)(url, output, None)
-
-
-def _copied(url: str, output: _Counted) -> None:
-    with open(url, "rb") as file:
-        shutil.copyfileobj(file, output, _CHUNK)  # type: ignore[arg-type]
-
-
-def _fetch(
-    shelf: Any, file: RemoteFile, fetch: Callable[[str, _Counted], None], count: _Count
-) -> None:
-    """Bring one file into the cache unless it is there."""
-
-    def downloader(url: str, output_file: str, pooch: object) -> None:
-        nonlocal written
-        with open(output_file, "wb") as opened:
-            counted = _Counted(opened, count)
-            try:
-                fetch(url, counted)
-            finally:
-                written = counted.size
-        if written < file.size:
+    def __call__(self, url: str, output_file: str, pooch: object) -> None:
+        self.restart()
+        with open(output_file, "wb") as self._output:
+            self._fetch(url, self)
+        if self.written < self.file.size:
             raise _HalfAFileError
 
-    written = 0
-    url = shelf.get_url(file.path)
+    def write(self, data: bytes) -> None:
+        self._output.write(data)
+        self._add(len(data))
+
+    def restart(self) -> None:
+        """Forget what has come."""
+        self._add(-self.written)
+
+    def found(self) -> None:
+        """Count the file as a whole, if none of it had to come."""
+        self._add(self.file.size - self.written)
+
+    def _add(self, size: int) -> None:
+        self.written += size
+        self._count.add(size)
+
+
+def _over_http(session: Any, url: str, output: _Transfer) -> None:
+    # not by pooch's own, which leaves what it breaks off open, and connects anew for each file
+    with session.get(url, stream=True, timeout=_TIMEOUT_S) as response:
+        response.raise_for_status()
+        for chunk in response.iter_content(_CHUNK):
+            output.write(chunk)
+
+
+def _copied(url: str, output: _Transfer) -> None:
+    with open(url, "rb") as file:
+        shutil.copyfileobj(file, output, _CHUNK)
+
+
+def _shelve(shelf: Any, transfer: _Transfer) -> None:
+    """Bring one file into the cache unless it is there."""
+    path = transfer.file.path
     for patience in (*_PATIENCE_S, None):
         try:
-            shelf.fetch(file.path, downloader=downloader)
+            # pooch looks and then makes it, and meanwhile another thread may have made it
+            Path(shelf.abspath, path).parent.mkdir(parents=True, exist_ok=True)
+            shelf.fetch(path, downloader=transfer)
             break
         except Exception as error:  # of the network, the disk, or pooch's own
             if patience is None or not _may_pass(error):
-                raise LaeError(_reason(error, url, file, written, shelf.abspath)) from error
-            count.add(-written)
+                raise LaeError(_reason(error, shelf, transfer)) from error
             time.sleep(patience)
-    if not written:
-        count.add(file.size)
+    transfer.found()
 
 
 def _may_pass(error: Exception) -> bool:
     """Whether another try may help."""
     import requests
 
-    if isinstance(error, requests.HTTPError):
-        return error.response is not None and error.response.status_code in _BUSY
     broken = (_HalfAFileError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
-    return isinstance(error, broken)
+    return isinstance(error, broken) or _status(error) in _BUSY
 
 
-def _reason(error: Exception, url: str, file: RemoteFile, written: int, cache: Path) -> str:
+def _status(error: Exception) -> int | None:
+    """What an HTTP server said, if it did."""
+    return getattr(getattr(error, "response", None), "status_code", None)
+
+
+def _reason(error: Exception, shelf: Any, transfer: _Transfer) -> str:
     """What went wrong, and what to do."""
     import requests
 
-    again = "what has arrived is kept: run it again to go on"
+    file, url = transfer.file, shelf.get_url(transfer.file.path)
+    again = "what came whole is kept, and the next run goes on from there"
     if isinstance(error, (_HalfAFileError, requests.exceptions.ChunkedEncodingError)):
-        return f"{url}: ended after {written:,} of {file.size:,} bytes; {again}"
-    if isinstance(error, requests.HTTPError):
-        status = error.response.status_code if error.response is not None else "an error"
-        if status in _BUSY:
-            return f"{url}: the server says {status}; {again} later"
-        return f"{url}: the server says {status}; is it gone? --mirror takes it from elsewhere"
+        return f"{url}: ended after {transfer.written:,} of {file.size:,} bytes; {again}"
+    if (status := _status(error)) in _BUSY:
+        return f"{url}: the server is busy ({status}); {again}"
+    if status:
+        return f"{url}: the server says {status}; --mirror PLACE takes the files from elsewhere"
     if isinstance(error, requests.RequestException):
         return (
-            f"{url}: cannot be reached ({type(error).__name__}); {again} with a network, or give "
-            "a folder that has the files with --mirror"
+            f"{url}: cannot be reached ({type(error).__name__}): is there a network? "
+            "--mirror FOLDER takes the files from a folder"
         )
-    if isinstance(error, FileNotFoundError) and "://" not in url:
-        return f"the mirror has no {url}"
+    if isinstance(error, FileNotFoundError) and error.filename == url:
+        return f"{url}: the mirror has no such file"
     if isinstance(error, OSError):
-        space = f"; {again} elsewhere with {CACHE_VARIABLE}=FOLDER"
         reason = os.strerror(error.errno) if error.errno else one_line(str(error))
-        return f"cannot write {cache}: {reason}{space if error.errno == errno.ENOSPC else ''}"
+        return (
+            f"cannot write {shelf.abspath}: {reason}; {CACHE_VARIABLE}=FOLDER names another place"
+        )
     if isinstance(error, ValueError):  # pooch says of digests that they differ, and of nothing else
         return (
-            f"{url}: its SHA-256 is not {file.sha256[:12]}..., so it is not the file that the "
-            "recipe was made for; it is not kept"
+            f"{url}: not the file that the recipe is for: its SHA-256 is not "
+            f"{file.sha256[:12]}...; it is not kept"
         )
-    return f"{url}: {one_line(str(error))}"
+    return f"{url}: {described(error)}"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from zipfile import ZipFile
@@ -14,12 +14,9 @@ from lae_sim.evaluation.metrics import PYSOT
 from lae_sim.evaluation.scoring import Scorer
 from lae_sim.importers.convert import ConversionSummary, convert_results
 from lae_sim.recipes.catalogue import Recipe, Source, find_recipe
-from lae_sim.recipes.download import download
+from lae_sim.recipes.download import Progress, download
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
-
-Progress = Callable[[int, int], object]
-"""``progress(done, total)`` is called as bytes arrive."""
 
 TOLERANCE = 5.1e-5
 """By how much a score may differ from that of a recipe, which has four digits."""
@@ -29,7 +26,7 @@ def get_trace(
     recipe: str | Recipe,
     *,
     time: str | None = None,
-    mirror: str | None = None,
+    mirror: str | os.PathLike[str] | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Trace:
     """Make a trace of public results: download what is not there yet, check it, convert it.
@@ -64,7 +61,7 @@ def made(
     recipe: str | Recipe,
     *,
     time: str | None = None,
-    mirror: str | None = None,
+    mirror: str | os.PathLike[str] | None = None,
     progress: Progress = lambda done, total: None,
 ) -> tuple[Trace, ConversionSummary]:
     """The trace that :func:`get_trace` makes, and what its conversion says."""
@@ -83,7 +80,6 @@ def made(
             tracker=recipe.tracker,
             device=recipe.boxes.repository.device,
             dataset=recipe.dataset,
-            skip_missing=True,
         )
     document = {**trace.metadata.document, "origin": recipe.origin()}
     return replace(trace, metadata=Metadata.of(document)), summary
@@ -118,7 +114,7 @@ class Verdict:
 def check_recipe(
     recipe: str | Recipe,
     *,
-    mirror: str | None = None,
+    mirror: str | os.PathLike[str] | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Verdict:
     """Make a recipe's trace and score its boxes, latency not counted.
