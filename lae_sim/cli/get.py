@@ -34,7 +34,7 @@ examples:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lae-sim get``; see ``--help``."""
-    arguments = _parser().parse_args(argv)
+    arguments = parser().parse_args(argv)
     return exit_status(
         lambda: _get(arguments),
         "lae-sim get",
@@ -43,13 +43,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = new_parser(
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = new_parser(
         "lae-sim get",
         "Make a trace of public results, by name; without a name, list those there are.",
         _EXAMPLES,
     )
-    add = parser.add_argument
+    add = made.add_argument
     add("recipe", nargs="*", metavar="NAME", help="dataset/tracker, as the list has it")
     add("--out", type=Path, metavar="TRACE", help="of one NAME (default: DATASET-TRACKER.parquet)")
     add(
@@ -75,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
         help="replace a trace of another tracker or dataset, or what is no trace",
     )
     add("--json", action="store_true", help="print JSON")
-    return parser
+    return made
 
 
 def _get(arguments: argparse.Namespace) -> None:
@@ -98,6 +99,7 @@ def _get(arguments: argparse.Namespace) -> None:
 
 
 def _make(recipes: Sequence[Recipe], arguments: argparse.Namespace) -> None:
+    from lae_sim.cli.convert import lines_of
     from lae_sim.recipes.make import made
     from lae_sim.trace.file import check_replaces, write_trace
 
@@ -117,10 +119,10 @@ def _make(recipes: Sequence[Recipe], arguments: argparse.Namespace) -> None:
                 progress=_in_kilobytes(bar),
             )
         write_trace(trace, path)
-        documents.append({**summary.document(path), "origin": recipe.origin()})
+        conversion = summary.document(path)
+        documents.append({"origin": recipe.origin(), "conversion": conversion})
         if not arguments.json:
-            of_times = summary.timing["source"]
-            print_text(_text(recipe, path, summary.frames, summary.median_ms, of_times))
+            print_text("\n".join([*lines_of(summary, path), *_lines(recipe, path)]))
     if arguments.json:
         _print_document(documents, "traces")
 
@@ -129,22 +131,22 @@ def _in_kilobytes(bar: ProgressBar) -> Callable[[int, int], None]:
     return lambda done, total: bar(done // 1000, total // 1000)
 
 
-def _text(recipe: Recipe, path: Path, frames: int, median_ms: float, times: str) -> str:
-    """What was made, for people."""
-    boxes, truth = recipe.boxes.repository, recipe.truth.repository
-    lines = [
-        f"{path}: {recipe.tracker} on {recipe.dataset}, {recipe.sequences} sequences, "
-        f"{frames:,} frames at {recipe.fps} fps, every frame; median {median_ms:.3g} ms a frame",
-        f"times:    {times}",
-        *([f"device:   {boxes.device}"] if boxes.device else []),
-        f"boxes:    {boxes.url}, commit {boxes.commit[:12]}; licence: {boxes.licence}",
-        f"truth:    {truth.url}, commit {truth.commit[:12]}; licence: {truth.licence}",
-        *(f"cite:     {text}" for text in recipe.citations),
-        *([f"note:     {recipe.note}"] if recipe.note else []),
-    ]
-    if recipe.time != "measured" and times.startswith("constant"):
-        lines[1] += " (none were published; --time, or --latency of lae-sim replay, sets others)"
-    return "\n".join([*lines, f"Next: lae-sim replay {path}"])
+def _lines(recipe: Recipe, path: Path) -> list[str]:
+    """Where a trace is from, for people, and how to go on."""
+    said = []
+    if recipe.time != "measured":
+        said.append(
+            "No times were published: --time here, or --latency of lae-sim replay, sets them."
+        )
+    if recipe.boxes.repository.device:
+        said.append(f"Device: {recipe.boxes.repository.device}.")
+    for what, source in (("Boxes", recipe.boxes), ("Truth", recipe.truth)):
+        where = source.repository
+        said.append(f"{what}: {where.url} at {where.commit[:12]}; licence: {where.licence}.")
+    said += [f"Cite: {text}." for text in recipe.citations]
+    if recipe.note:
+        said.append(f"Note: {recipe.note}.")
+    return [*said, f"Next: lae-sim replay {path}"]
 
 
 def _check(recipes: Sequence[Recipe], arguments: argparse.Namespace) -> None:
@@ -173,7 +175,7 @@ def _check(recipes: Sequence[Recipe], arguments: argparse.Namespace) -> None:
         if not arguments.json:
             print_text(_verdict(verdict))
     if arguments.json:
-        _print_document(documents, "recipes")
+        _print_document(documents, "checks")
     if failed:
         raise LaeError(f"{len(failed)} of {len(recipes)} recipes fail: {listed(failed)}")
 

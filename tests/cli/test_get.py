@@ -6,12 +6,16 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 from command_line import run_here
+from places import REPOSITORY
 from published import ROOT, made_up, served
 
 import lae_sim
 from lae_sim.recipes import catalogue
+
+SCHEMA = REPOSITORY / "docs" / "reference" / "schemas" / "get.schema.json"
 
 
 @pytest.fixture
@@ -40,7 +44,10 @@ def refused(folder: Path, *arguments: object) -> str:
 
 
 def document(text: str) -> Any:
-    return json.loads(text)
+    found = json.loads(text)
+    if "traces" not in found:  # whose schema is of two files
+        jsonschema.validate(found, json.loads(SCHEMA.read_text("utf-8")))
+    return found
 
 
 def test_the_list_has_a_line_a_recipe(tmp_path: Path) -> None:
@@ -69,13 +76,13 @@ def test_a_trace_is_made_from_a_server_and_again_without_it(mirror: Path, tmp_pa
         text = get(tmp_path, "made-up/kcf", "--mirror", server.url)
     assert text.splitlines() == [
         "made-up-kcf.parquet: KCF on MadeUp, 3 sequences, 60 frames at 30 fps, every frame; "
-        "median 20 ms a frame",
-        "times:    measured",
-        "device:   a desk",
-        "boxes:    https://github.com/someone/results, commit 0123456789ab; licence: CC BY 4.0",
-        "truth:    https://github.com/someone/results, commit 0123456789ab; licence: CC BY 4.0",
-        "cite:     Someone, Results, 2020",
-        "cite:     Another, A Dataset, 2019",
+        "median 20 ms a frame. Read as got10k; times: measured.",
+        "Times read as seconds per frame, as no unit was given.",
+        "Device: a desk.",
+        "Boxes: https://github.com/someone/results at 0123456789ab; licence: CC BY 4.0.",
+        "Truth: https://github.com/someone/results at 0123456789ab; licence: CC BY 4.0.",
+        "Cite: Someone, Results, 2020.",
+        "Cite: Another, A Dataset, 2019.",
         "Next: lae-sim replay made-up-kcf.parquet",
     ]
     first = (tmp_path / "made-up-kcf.parquet").read_bytes()
@@ -88,15 +95,15 @@ def test_a_trace_is_made_from_a_server_and_again_without_it(mirror: Path, tmp_pa
 
 def test_times_that_nobody_published_are_named_so(mirror: Path, tmp_path: Path) -> None:
     text = get(tmp_path, "made-up/nano", "--mirror", mirror)
-    assert "times:    constant 47 ms, not measured (none were published; --time, or" in text
+    assert "times: constant 47 ms, not measured." in text
+    assert "No times were published: --time here, or --latency of lae-sim replay, sets" in text
     text = get(tmp_path, "made-up/nano", "--time", "mean-fps:50")
-    assert "times:    mean fps 50 given, not measured per frame\n" in text
-    assert "median 20 ms" in text
+    assert "median 20 ms a frame. Read as ope; times: mean fps 50 given, not measured per" in text
 
 
 def test_several_at_once_as_json(mirror: Path, tmp_path: Path) -> None:
     found = document(get(tmp_path, "made-up/kcf", "made-up/nano", "--mirror", mirror, "--json"))
-    assert [each["trace"] for each in found["traces"]] == [
+    assert [each["conversion"]["trace"] for each in found["traces"]] == [
         "made-up-kcf.parquet",
         "made-up-nano.parquet",
     ]
@@ -134,7 +141,7 @@ def test_recipes_are_checked(mirror: Path, tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "cache" / ROOT / "nano.zip").unlink()
     done = run_here("get", "--check", "--json", "--mirror", mirror, cwd=tmp_path)
     assert done.returncode == 2
-    kcf, nano = document(done.stdout)["recipes"]
+    kcf, nano = document(done.stdout)["checks"]
     assert (kcf["holds"], nano["holds"]) == (True, False)
     assert "nano.zip" in nano["error"]
     assert "1 of 2 recipes fail: made-up/nano" in done.stderr
