@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from unittest.mock import patch
 from zipfile import ZipFile
 
 from lae_sim.recipes.catalogue import Recipe, list_recipes
@@ -141,7 +143,8 @@ def served(mirror: Path) -> Iterator[Server]:
             pass
 
     make: Callable[..., Handler] = partial(Handler, directory=str(mirror))
-    with ThreadingHTTPServer(("127.0.0.1", 0), make) as http:
+    here = patch.dict(os.environ, NO_PROXY="127.0.0.1", no_proxy="127.0.0.1")
+    with here, ThreadingHTTPServer(("127.0.0.1", 0), make) as http:
         thread = threading.Thread(target=http.serve_forever, daemon=True)
         thread.start()
         server.url = f"http://127.0.0.1:{http.server_address[1]}"
