@@ -18,7 +18,7 @@ import argparse
 import json
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ import lae_sim
 from lae_sim import Metadata, Recording, Trace, evaluate, load_forecaster, read_trace
 from lae_sim.datasets.layouts import find_dataset
 from lae_sim.engine.times import Times
+from lae_sim.forecast.base import notes_of
 from lae_sim.plugins import key_and_value, parse_options
 from lae_sim.profile import profile_tracker
 from lae_sim.report.table import aligned
@@ -167,7 +168,7 @@ def scores(label: str, trace: Trace, setting: Setting, forecasters: Iterable[str
     """The scores of hold and of each forecaster, a row for each permitted latency."""
     world = {"search": "off", **setting.world}
     made = evaluate(trace, forecasters=["hold", *forecasters], progress=False, **world)
-    found = made.summary.to_dict("records")
+    found: list[Row] = made.summary.to_dict("records")
     first: dict[float, Row] = {}
     for row in found:
         hold = first.setdefault(row["sigma"], row)
@@ -220,36 +221,30 @@ def by_trace(rows: Sequence[Row], arguments: Arguments) -> str:
 
 
 def by_dataset(
-    rows: Sequence[Row],
-    arguments: Arguments,
-    shown: Callable[[Sequence[Sequence[Row]]], str],
-    first: Sequence[str] = (),
-) -> str:
-    """A line per setting: of each dataset what is shown of the rows of each forecaster."""
+    rows: Sequence[Row], names: Sequence[str], shown: Callable[[Sequence[Sequence[Row]]], str]
+) -> tuple[list[str], list[list[str]]]:
+    """Header and a line per setting: of each dataset what is shown of the rows of forecasters."""
     datasets = distinct(rows, "dataset")
     number = {name: len(distinct(of(rows, dataset=name), "trace")) for name in datasets}
-    names = [*first, *arguments.forecasters]
-    header = ["setting", *(f"{name} ({number[name]})" for name in datasets), "least over hold"]
     table = []
     for setting in distinct(rows, "setting"):
         some = of(rows, setting=setting)
-        cells = [
-            shown([of(some, dataset=dataset, forecaster=name) for name in names])
-            for dataset in datasets
-        ]
-        least = (of(some, forecaster=name) for name in arguments.forecasters)
-        table.append([setting, *cells, "; ".join(map(least_over_hold, least))])
-    return aligned(header, table, labels=1)
-
-
-def mean_shares(forecasters: Sequence[Sequence[Row]]) -> str:
-    """The mean share of what latency costs that each forecaster wins back, in %."""
-    return percent(fmean(row["recovered_auc"] for row in rows) for rows in forecasters)
+        own = ([of(some, dataset=each, forecaster=name) for name in names] for each in datasets)
+        table.append([setting, *map(shown, own)])
+    return ["setting", *(f"{name} ({number[name]})" for name in datasets)], table
 
 
 def shares_by_dataset(rows: Sequence[Row], arguments: Arguments) -> str:
     """A line per setting: the mean shares on each dataset, in %."""
-    return by_dataset(rows, arguments, mean_shares)
+
+    def shown(forecasters: Sequence[Sequence[Row]]) -> str:
+        return percent(fmean(row["recovered_auc"] for row in each) for each in forecasters)
+
+    header, table = by_dataset(rows, arguments.forecasters, shown)
+    for line in table:
+        own = (of(rows, setting=line[0], forecaster=name) for name in arguments.forecasters)
+        line.append("; ".join(map(least_over_hold, own)))
+    return aligned([*header, "least over hold, AUC and DP"], table, labels=1)
 
 
 def modelled_by_dataset(rows: Sequence[Row], arguments: Arguments) -> str:
@@ -258,9 +253,7 @@ def modelled_by_dataset(rows: Sequence[Row], arguments: Arguments) -> str:
     def shown(forecasters: Sequence[Sequence[Row]]) -> str:
         return score_text(fmean(row["modelled_auc"] for row in each) for each in forecasters)
 
-    table = by_dataset(rows, arguments, shown, first=("hold",))
-    lines = (line.rpartition("  ")[0].rstrip() for line in table.splitlines())
-    return "\n".join(lines)  # what is won over hold is of the recorded boxes
+    return aligned(*by_dataset(rows, ["hold", *arguments.forecasters], shown), labels=1)
 
 
 def score_text(values: Iterable[float]) -> str:
@@ -281,36 +274,66 @@ def scores_by_trace(rows: Sequence[Row], arguments: Arguments) -> str:
     return aligned(["trace", "setting", *names, "offline"], table)
 
 
-PUBLISHED: Mapping[str, Mapping[str, float | None]] = {
-    "DTB70": {"fps": 21.2, "none": 0.298, "motion": 0.385, "both": 0.399, "offline": 0.593},
-    "UAVDT": {"fps": 22.5, "none": 0.494, "motion": 0.529, "both": 0.576, "offline": 0.556},
-    "UAV20L": {"fps": None, "none": 0.448, "motion": 0.481, "both": 0.508, "offline": None},
-    "UAV123": {"fps": 22.0, "none": 0.472, "motion": 0.537, "both": 0.537, "offline": 0.610},
-}
-"""RPN_mob without and with PVT++'s predictors of motion, and of motion and vision: AUC on a Jetson
-AGX Xavier, from MODEL_ZOO.md of its repository (github.com/Jaraxxus-Me/PVT_pp), which calls it
-mAUC. Frames/s and offline AUC of that tracker on that device are from "Predictive Visual Tracking"
-(2021), Table II and ``fig/overall.png`` of its repository."""
+@dataclass(frozen=True)
+class Published:
+    """AUC of RPN_mob on a Jetson AGX Xavier, and what PVT++'s predictors make of it.
 
-FAMILY = {"init": "200ms", "c": "0.45"}
-"""An initialisation and a reach with which replays come near to what that paper measured of this
-tracker (``benchmarks/paper_tables.py``)."""
+    The scores are from ``MODEL_ZOO.md`` of its repository (github.com/Jaraxxus-Me/PVT_pp), which
+    calls them mAUC. Frames/s and offline AUC of the tracker are from "Predictive Visual Tracking"
+    (2021), Table II and ``fig/overall.png`` of its repository.
+
+    Attributes:
+        dataset: its name.
+        none, motion, both: without a predictor, with that of motion, with that of motion and sight.
+        fps, offline: None if not published.
+    """
+
+    dataset: str
+    none: float
+    motion: float
+    both: float
+    fps: float | None = None
+    offline: float | None = None
+
+    def line(self) -> list[str]:
+        """What the table says of it."""
+        gains = [each - self.none for each in (self.motion, self.both)]
+        lost = self.offline and self.offline - self.none
+        return [
+            self.dataset,
+            f"{1000 / self.fps:.1f}" if self.fps else "?",
+            *(score_text([each]) for each in (self.none, self.motion, self.both)),
+            score_text([self.offline]) if self.offline else "?",
+            *(percent([gain / lost]) if lost else "?" for gain in gains),
+        ]
+
+
+PUBLISHED = (
+    Published("DTB70", 0.298, 0.385, 0.399, 21.2, 0.593),
+    Published("UAVDT", 0.494, 0.529, 0.576, 22.5, 0.556),
+    Published("UAV20L", 0.448, 0.481, 0.508),
+    Published("UAV123", 0.472, 0.537, 0.537, 22.0, 0.610),
+)
+
+INIT, REACH = "200ms", "c=0.45"
+"""An initialisation and a reach with which replays come near to what PVT measured of RPN_mob
+(``benchmarks/paper_tables.py``)."""
 
 
 def beside_pvt_plus(arguments: Arguments) -> list[Row]:
     """Stand-ins under the protocol, at three constant times each."""
+    of_dataset = {each.dataset: each for each in PUBLISHED}
     rows = []
     for label, trace in arguments.traces.items():
-        published = PUBLISHED.get(trace.metadata.dataset)
-        if published is None or not (fps := published["fps"]):
+        published = of_dataset.get(trace.metadata.dataset)
+        if published is None or not (published.fps and published.offline):
             continue
-        kept = published["none"] / published["offline"]  # type: ignore[operator]
-        its, slow = round(1e9 / fps), slowest(label, trace, kept) * 10**6
-        init, reach = f"{its}ns,init={FAMILY['init']}", f"c={FAMILY['c']}"
+        its = round(1e9 / published.fps)
+        slow = slowest(label, trace, published.none / published.offline) * 10**6
         for ns, setting in (
             (its, constant(f"{its}ns", "its frames/s", sigma="grid")),
             (slow, constant(f"{slow}ns", "as much lost", sigma="grid")),
-            (its, constant(init, "search model", search=reach, sigma="grid")),
+            (its, constant(f"{its}ns,init={INIT}", "search model", search=REACH, sigma="grid")),
         ):
             found = scores(label, trace, setting, arguments.forecasters)
             rows += [{**row, "call_ms": ns / 10**6} for row in found]
@@ -329,44 +352,29 @@ def slowest(label: str, trace: Trace, share: float) -> int:
 
 def published_and_stand_ins(rows: Sequence[Row], arguments: Arguments) -> str:
     """What was published, and below it the mean over the stand-ins of each dataset."""
-    table = []
-    for dataset, each in PUBLISHED.items():
-        offline, none = each["offline"], each["none"]
-        values = [score_text([each[name]]) for name in ("none", "motion", "both")]  # type: ignore
-        shares = ["?", "?"]
-        if offline is not None and none is not None:
-            gains = (each[name] - none for name in ("motion", "both"))  # type: ignore[operator]
-            shares = [percent([gain / (offline - none)]) for gain in gains]
-        time = f"{1000 / each['fps']:.1f}" if each["fps"] else "?"
-        table.append(
-            [dataset, time, *values, "?" if offline is None else score_text([offline]), *shares]
-        )
-    header = ["published", "ms", "none", "motion", "both", "offline", "% motion", "% both"]
-    lines = [aligned(header, table, labels=1), ""]
-    table = []
-    names = ["hold", *arguments.forecasters]
+    header = ["RPN_mob", "ms", "none", "motion", "both", "offline", "% motion", "% both"]
+    published = aligned(header, [each.line() for each in PUBLISHED], labels=1)
+    names, table = ["hold", *arguments.forecasters], []
     for dataset in distinct(rows, "dataset"):
-        of_dataset = of(rows, dataset=dataset)
         for setting in distinct(rows, "setting"):
-            some = of(of_dataset, setting=setting)
+            some = of(rows, dataset=dataset, setting=setting)
             kind = "modelled_auc" if setting == "search model" else "auc"
             own = [of(some, forecaster=name) for name in names]
             zero = [fmean(row[kind] for row in of(each, sigma=0)) for each in own]
             grid = [fmean(row[kind] for row in each) for each in own]
             offline = fmean(row["offline_auc"] for row in some)
             ms = sorted(row["call_ms"] for row in some)
-            table.append([
-                dataset,
-                setting,
-                " to ".join(dict.fromkeys(f"{each:.1f}" for each in (ms[0], ms[-1]))),
-                score_text(zero),
-                score_text([offline]),
-                percent((value - zero[0]) / (offline - zero[0]) for value in zero[1:]),
-                percent((value - grid[0]) / (offline - grid[0]) for value in grid[1:]),
-            ])  # fmt: skip
+            shares = (
+                percent((value - hold) / (offline - hold) for value in others)
+                for hold, *others in (zero, grid)
+            )
+            times = " to ".join(dict.fromkeys(f"{each:.1f}" for each in (ms[0], ms[-1])))
+            table.append(
+                [dataset, setting, times, score_text(zero), score_text([offline]), *shares]
+            )
     shown = " / ".join(names), " / ".join(arguments.forecasters)
     header = ["stand-ins", "times", "ms", shown[0], "offline", f"% {shown[1]}", "% of mAUC"]
-    return "\n".join([*lines, aligned(header, table)])
+    return f"{published}\n\n{aligned(header, table)}"
 
 
 def camera_motion(arguments: Arguments) -> list[Row]:
@@ -381,21 +389,25 @@ def camera_motion(arguments: Arguments) -> list[Row]:
         for name in sorted(framed.intersection(trace.names)):
             one = Trace(trace.metadata, [trace[name]])
             for time in LATENCIES:
-                world = {"root": root, "camera_lag": 1, "sequences": name}
+                world: Row = {"root": root, "camera_lag": 1, "sequences": name}
                 found = scores(label, one, constant(time, **world), forecasters)
                 rows += [{**row, "sequence": name} for row in found]
     return rows
 
 
-def means(rows: Sequence[Row], arguments: Arguments) -> str:
-    """A line per setting: the mean AUC of each forecaster over traces and sequences, in %."""
+def mean_of_sequences(rows: Sequence[Row], arguments: Arguments) -> str:
+    """A line per setting: of each sequence the mean AUC of its traces, of which the mean, in %."""
+
+    def mean(some: Sequence[Row], metric: str) -> str:
+        own = (of(some, sequence=name) for name in distinct(some, "sequence"))
+        return f"{100 * fmean(fmean(row[metric] for row in each) for each in own):.1f}"
+
     names = distinct(rows, "forecaster")
     table = []
     for setting in distinct(rows, "setting"):
         own = [of(rows, setting=setting, forecaster=name) for name in names]
-        values = [fmean(row["auc"] for row in each) for each in own]
-        values.append(fmean(row["offline_auc"] for row in own[0]))
-        table.append([setting, *(f"{100 * value:.1f}" for value in values)])
+        offline = mean(own[0], "offline_auc")
+        table.append([setting, *(mean(each, "auc") for each in own), offline])
     return aligned(["time", *names, "offline"], table, labels=1)
 
 
@@ -567,9 +579,10 @@ stand-ins: other trackers, boxes of every frame, forecast from boxes alone; of U
   search model: its frames/s, initialisation 200 ms, c = 0.45: modelled AUC, which comes nearest""",
     ),
     "camera": Section(
-        "mean AUC in %, over the traces' sequences of which there are frames; --camera-lag 1",
+        "mean AUC in % over sequences of which there are frames, of each the mean over traces; "
+        "camera_lag=1",
         camera_motion,
-        means,
+        mean_of_sequences,
     ),
     "closed-loop": Section(
         "AUC / DP at 20 px of the tracker run live under constant times (assumed, not measured)",
@@ -584,6 +597,12 @@ def read(path: str) -> Trace:
     """A trace that is kept in memory."""
     trace = read_trace(path)
     return Trace(trace.metadata, list(trace))
+
+
+def weights() -> str:
+    """The digest of the weights of learned, shortened."""
+    (note,) = notes_of(load_forecaster("learned"), [])
+    return note.removeprefix("weights ")
 
 
 def main() -> None:
@@ -605,9 +624,10 @@ def main() -> None:
     if given.json:
         print(json.dumps(rows, indent=2, default=str))
         return
-    weights = load_forecaster("learned").notes([])[0]
     print(asked.title, "", asked.printed(rows, arguments), "", sep="\n")
-    print(*filter(None, [asked.caveats]), f"lae_sim {lae_sim.__version__}, {weights}", sep="\n")
+    if asked.caveats:
+        print(asked.caveats)
+    print(f"lae_sim {lae_sim.__version__}, weights of learned {weights()}")
 
 
 if __name__ == "__main__":
