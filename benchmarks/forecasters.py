@@ -572,11 +572,11 @@ SECTIONS: Mapping[str, Section] = {
 published: the model zoo calls it mAUC, but its command converts at sigma = 0, and the figures
   without a predictor on UAVDT and UAV123 are those of PVT's Table II at sigma = 0; offline: from
   PVT's figure, of the tracker without PVT++'s training (so more than 100 % can be won); ?: unknown
-stand-ins: other trackers, boxes of every frame, forecast from boxes alone; of UAV20L no tracker's
-  boxes are at hand
+stand-ins: other trackers, boxes of every frame, forecast from boxes alone; none on UAV20L: 4 of its
+  20 sequences are whole in UAV123, the others in parts, on each of which a tracker starts anew
   its frames/s: as PVT publishes them, recorded boxes, which lose no target: too good
   as much lost: the constant times at which hold keeps the same share of its offline AUC as RPN_mob
-  search model: its frames/s, initialisation 200 ms, c = 0.45: modelled AUC, which comes nearest""",
+  search model: modelled AUC at its frames/s, initialisation 200 ms, c = 0.45, chosen by PVT's tables""",
     ),
     "camera": Section(
         "mean AUC in % over sequences of which there are frames, of each the mean over traces; "
