@@ -576,7 +576,7 @@ stand-ins: other trackers, boxes of every frame, forecast from boxes alone; none
   20 sequences are whole in UAV123, the others in parts, on each of which a tracker starts anew
   its frames/s: as PVT publishes them, recorded boxes, which lose no target: too good
   as much lost: the constant times at which hold keeps the same share of its offline AUC as RPN_mob
-  search model: modelled AUC at its frames/s, initialisation 200 ms, c = 0.45, chosen by PVT's tables""",
+  search model: modelled AUC at its frames/s; initialisation 200 ms, c = 0.45: fit PVT's tables""",
     ),
     "camera": Section(
         "mean AUC in % over sequences of which there are frames, of each the mean over traces; "
