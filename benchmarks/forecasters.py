@@ -125,7 +125,7 @@ def chosen(recording: Recording, frames: Any, **more: Any) -> Recording:
 
 
 def shifted(trace: Trace, frames: int) -> Trace:
-    """Boxes that are so many frames early, but for the first one; below zero, late."""
+    """Boxes that are so many frames early, but for the first one."""
 
     def of(recording: Recording) -> Recording:
         source = np.clip(np.arange(len(recording)) + frames, 0, len(recording) - 1)
@@ -203,21 +203,36 @@ def percent(shares: Iterable[float]) -> str:
     return " / ".join(f"{100 * share:.0f}" for share in shares)
 
 
-def least_over_hold(rows: Iterable[Row]) -> str:
-    """The least that is won over hold in AUC and DP, or the most that is lost."""
-    rows = list(rows)
-    return " ".join(f"{min(row[f'{m}_over_hold'] for row in rows):+.4f}" for m in ("auc", "dp20"))
+def least_over_hold(rows: Sequence[Row], forecasters: Iterable[str]) -> str:
+    """A line: the least that each forecaster wins over hold anywhere, below zero where it loses."""
+
+    def least(name: str) -> str:
+        own = of(rows, forecaster=name)
+        values = (min(row[f"{metric}_over_hold"] for row in own) for metric in ("auc", "dp20"))
+        return " ".join([name, *(f"{value:+.4f}" for value in values)])
+
+    return f"least over hold, AUC and DP: {', '.join(map(least, forecasters))}"
 
 
 def by_trace(rows: Sequence[Row], arguments: Arguments) -> str:
-    """A line per trace: each forecaster's shares in all settings."""
-    header = ["trace", *arguments.forecasters, "least over hold, AUC and DP"]
-    table = []
-    for trace in distinct(rows, "trace"):
-        own = [of(rows, trace=trace, forecaster=name) for name in arguments.forecasters]
-        shares = (percent(row["recovered_auc"] for row in each) for each in own)
-        table.append([trace, *shares, "; ".join(map(least_over_hold, own))])
-    return aligned(header, table, labels=1)
+    """A line per trace: each forecaster's shares in all settings; and their means."""
+    settings = distinct(rows, "setting")
+
+    def line(name: str, some: Sequence[Row]) -> list[str]:
+        own = ([of(some, forecaster=each, setting=at) for at in settings] for each in forecasters)
+        return [name, *(percent(mean_share(each) for each in cells) for cells in own)]
+
+    forecasters, traces = arguments.forecasters, distinct(rows, "trace")
+    table = [line(trace, of(rows, trace=trace)) for trace in traces]
+    if len(traces) > 1:
+        table.append(line(f"mean of the {len(traces)}", rows))
+    lines = aligned(["trace", *forecasters], table, labels=1)
+    return f"{lines}\n{least_over_hold(rows, forecasters)}"
+
+
+def mean_share(rows: Iterable[Row]) -> float:
+    """The mean share of what latency costs that is won back."""
+    return fmean(row["recovered_auc"] for row in rows)
 
 
 def by_dataset(
@@ -238,13 +253,10 @@ def shares_by_dataset(rows: Sequence[Row], arguments: Arguments) -> str:
     """A line per setting: the mean shares on each dataset, in %."""
 
     def shown(forecasters: Sequence[Sequence[Row]]) -> str:
-        return percent(fmean(row["recovered_auc"] for row in each) for each in forecasters)
+        return percent(map(mean_share, forecasters))
 
-    header, table = by_dataset(rows, arguments.forecasters, shown)
-    for line in table:
-        own = (of(rows, setting=line[0], forecaster=name) for name in arguments.forecasters)
-        line.append("; ".join(map(least_over_hold, own)))
-    return aligned([*header, "least over hold, AUC and DP"], table, labels=1)
+    lines = aligned(*by_dataset(rows, arguments.forecasters, shown), labels=1)
+    return f"{lines}\n{least_over_hold(rows, arguments.forecasters)}"
 
 
 def modelled_by_dataset(rows: Sequence[Row], arguments: Arguments) -> str:
@@ -446,8 +458,8 @@ def searches(forecasters: Sequence[str]) -> list[tuple[str | None, bool]]:
 
 
 def search_text(pre: str | None, keep_size: bool) -> str:
-    """What says where the tracker searches."""
-    return f"search by {pre or 'none'}" + ", size kept" * keep_size
+    """What forecasts before the tracker where it searches."""
+    return f"before: {pre or 'none'}" + ", size kept" * keep_size
 
 
 def mean_scores(rows: Sequence[Row], arguments: Arguments) -> str:
@@ -555,11 +567,10 @@ SECTIONS: Mapping[str, Section] = {
         ],
     ),
     "early": section(
-        "AUC / DP at 20 px where the tracker's boxes are a frame early, or late",
+        "AUC / DP at 20 px where the tracker's boxes are a frame early",
         scores_by_trace,
         [
-            Setting(f"{name}, {time}", {"latency": f"constant:{time}"}, partial(shifted, frames=n))
-            for name, n in (("early", 1), ("late", -1))
+            Setting(f"early, {time}", {"latency": f"constant:{time}"}, partial(shifted, frames=1))
             for time in LATENCIES
         ],
     ),

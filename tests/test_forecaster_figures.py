@@ -55,7 +55,7 @@ def one(every_frame: Metadata) -> Trace:
         ("drops", 3),
         ("rates", 4),
         ("search", 10),
-        ("early", 8),
+        ("early", 4),
     ],
 )
 def test_every_section_has_a_line_of_known_figures_per_setting(
@@ -69,7 +69,9 @@ def test_every_section_has_a_line_of_known_figures_per_setting(
     figure = "modelled_auc" if section == "search" else "auc"
     assert all(0 < row[figure] < row["offline_auc"] for row in rows if section != "early")
     printed = asked.printed(rows, arguments).splitlines()
-    assert len(printed) == 2 + lines
+    has_least = printed[-1].startswith("least over hold, AUC and DP: kalman ")
+    assert has_least == (section in ("shares", "jitter", "drops", "rates"))
+    assert len(printed) == 2 + lines + has_least
     assert "nan" not in "".join(printed)
 
 
@@ -109,10 +111,9 @@ def test_a_slower_camera_has_every_so_manieth_frame(figures: ModuleType, one: Tr
 
 
 def test_early_boxes_are_those_of_the_next_frame(figures: ModuleType, one: Trace) -> None:
-    (whole,), (early,), (late,) = one, figures.shifted(one, 1), figures.shifted(one, -1)
+    (whole,), (early,) = one, figures.shifted(one, 1)
     assert (early.boxes[0] == whole.boxes[0]).all()
     assert (early.boxes[1:-1] == whole.boxes[2:]).all()
-    assert (late.boxes[1:] == whole.boxes[:-1]).all()
 
 
 def test_stand_ins_lose_as_much_as_what_was_published(figures: ModuleType, few: Trace) -> None:
@@ -148,8 +149,8 @@ def test_sequences_with_frames_are_run_live_and_over_the_cameras_motion(
     live = figures.Arguments({}, ["kalman"], frames)
     rows = figures.closed_loops(live)
     printed = figures.mean_scores(rows, live)
-    assert "47ms, search by none " in printed
-    assert "100ms, search by kalman, size kept" in printed
+    assert "47ms, before: none " in printed
+    assert "100ms, before: kalman, size kept" in printed
     assert len(rows) == 2 * 2 * 2
 
     boxes = straight(12)
