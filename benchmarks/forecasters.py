@@ -19,7 +19,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -58,6 +58,10 @@ class Setting:
     name: str
     world: Mapping[str, Any] = field(default_factory=dict)
     changed: Callable[[Trace], Trace] = lambda trace: trace
+
+    def of(self, changed: Callable[[Trace], Trace]) -> Setting:
+        """The same for what becomes of the trace."""
+        return replace(self, changed=changed)
 
 
 def constant(time: str, name: str = "", **more: Any) -> Setting:
@@ -503,7 +507,8 @@ def section(
 
 
 SHARES = "share of the AUC lost to latency that is won back, in %"
-MEANS = f"{SHARES}: means over the traces of a dataset"
+JITTER = (0.1, 0.3, 0.6)
+LOST = (0.1, 0.3)
 
 SECTIONS: Mapping[str, Section] = {
     "shares": section(
@@ -517,38 +522,25 @@ SECTIONS: Mapping[str, Section] = {
         scores_by_trace,
         [Setting("as recorded"), Setting("times x 4", {"scale": 4})],
     ),
-    "jitter": section(
-        f"{MEANS}; lognormal times of 47 ms on average, standard deviation in % of it",
+    "conditions": section(
+        f"{SHARES}: means over the traces of a dataset; constant 47 ms, lognormal times that jitter "
+        "by so much (standard deviation), frames that the camera loses at random, other rates",
         shares_by_dataset,
         [
-            Setting(f"jitter {100 * share:.0f} %", {"latency": Jittered(share)})
-            for share in (0.0, 0.1, 0.3, 0.6)
+            constant("47ms", "47 ms, 30 fps"),
+            *(Setting(f"jitter {share:.0%}", {"latency": Jittered(share)}) for share in JITTER),
+            *(
+                constant("47ms", f"{share:.0%} of frames lost").of(partial(dropped, share=share))
+                for share in LOST
+            ),
+            *(
+                constant("47ms", f"{30 // step} fps, 1 frame in {step}").of(
+                    partial(thinned, step=step)
+                )
+                for step in (3, 2)
+            ),
+            constant("47ms", "60 fps, every frame", fps=60),
         ],
-    ),
-    "drops": section(
-        f"{MEANS}; the camera loses frames at random, constant 47 ms",
-        shares_by_dataset,
-        [
-            Setting(
-                f"{100 * share:.0f} % lost",
-                {"latency": "constant:47ms"},
-                partial(dropped, share=share),
-            )
-            for share in (0.0, 0.1, 0.3)
-        ],
-    ),
-    "rates": section(
-        f"{MEANS}; constant 47 ms",
-        shares_by_dataset,
-        [
-            Setting(
-                f"{30 // step} fps, 1 frame in {step}",
-                {"latency": "constant:47ms"},
-                partial(thinned, step=step),
-            )
-            for step in (3, 2)
-        ]
-        + [constant("47ms", f"{fps} fps, every frame", fps=fps) for fps in (30, 60)],
     ),
     "search": section(
         "modelled AUC of hold / the forecasters, c = 0.7, initialisation 400 ms: means over the "
@@ -569,10 +561,7 @@ SECTIONS: Mapping[str, Section] = {
     "early": section(
         "AUC / DP at 20 px where the tracker's boxes are a frame early",
         scores_by_trace,
-        [
-            Setting(f"early, {time}", {"latency": f"constant:{time}"}, partial(shifted, frames=1))
-            for time in LATENCIES
-        ],
+        [constant(time, f"early, {time}").of(partial(shifted, frames=1)) for time in LATENCIES],
     ),
     "pvt++": Section(
         "RPN_mob with PVT++ on its Xavier, and forecasters on stand-ins' boxes: AUC at sigma = 0, "

@@ -51,9 +51,7 @@ def one(every_frame: Metadata) -> Trace:
     [
         ("shares", 1),
         ("recorded", 2),
-        ("jitter", 4),
-        ("drops", 3),
-        ("rates", 4),
+        ("conditions", 9),
         ("search", 10),
         ("early", 4),
     ],
@@ -70,7 +68,7 @@ def test_every_section_has_a_line_of_known_figures_per_setting(
     assert all(0 < row[figure] < row["offline_auc"] for row in rows if section != "early")
     printed = asked.printed(rows, arguments).splitlines()
     has_least = printed[-1].startswith("least over hold, AUC and DP: kalman ")
-    assert has_least == (section in ("shares", "jitter", "drops", "rates"))
+    assert has_least == (section in ("shares", "conditions"))
     assert len(printed) == 2 + lines + has_least
     assert "nan" not in "".join(printed)
 
