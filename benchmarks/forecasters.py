@@ -104,18 +104,18 @@ def dropped(trace: Trace, share: float) -> Trace:
     """The camera has lost a share of the frames, at random: they have no row."""
     fps = trace.metadata.fps
 
-    def of(recording: Recording) -> Recording:
+    def changed(recording: Recording) -> Recording:
         kept = random(recording).random(len(recording)) >= share
         kept[0] = True
         frames = np.flatnonzero(kept)
         arrival_ns = frames * (10**9 * fps.denominator) // fps.numerator
         return chosen(recording, frames, arrival_ns=arrival_ns)
 
-    return Trace(trace.metadata, [of(recording) for recording in trace])
+    return Trace(trace.metadata, [changed(recording) for recording in trace])
 
 
 def thinned(trace: Trace, step: int) -> Trace:
-    """Every so manieth frame alone, as a camera of so much lower a rate would have it."""
+    """Every ``step``-th frame alone, as a camera of so much lower a rate would have it."""
     rate = str(trace.metadata.fps / step)
     metadata = Metadata.of({**trace.metadata.document, "fps": rate})
     thin = [chosen(each, np.arange(0, len(each), step)) for each in trace]
@@ -131,13 +131,13 @@ def chosen(recording: Recording, frames: Any, **more: Any) -> Recording:
 def shifted(trace: Trace, frames: int) -> Trace:
     """Boxes that are so many frames early, but for the first one."""
 
-    def of(recording: Recording) -> Recording:
+    def changed(recording: Recording) -> Recording:
         source = np.clip(np.arange(len(recording)) + frames, 0, len(recording) - 1)
         source[0] = 0
         boxes = recording.boxes[source]
         return Recording.new(recording.name, recording.truth, boxes, recording.elapsed_ns)
 
-    return Trace(trace.metadata, [of(recording) for recording in trace])
+    return Trace(trace.metadata, [changed(recording) for recording in trace])
 
 
 @dataclass(frozen=True)
