@@ -463,7 +463,7 @@ def searches(forecasters: Sequence[str]) -> list[tuple[str | None, bool]]:
 
 def search_text(pre: str | None, keep_size: bool) -> str:
     """What forecasts before the tracker where it searches."""
-    return f"before: {pre or 'none'}" + ", size kept" * keep_size
+    return (pre or "none") + ", size kept" * keep_size
 
 
 def mean_scores(rows: Sequence[Row], arguments: Arguments) -> str:
@@ -537,8 +537,8 @@ SECTIONS: Mapping[str, Section] = {
         ],
     ),
     "search": section(
-        "modelled AUC of hold / the forecasters, c = 0.7, initialisation 400 ms: means over the "
-        "traces of a dataset",
+        "modelled AUC of hold / the forecasters by what forecasts before the tracker, c = 0.7, "
+        "initialisation 400 ms: means over the traces of a dataset",
         modelled_by_dataset,
         [
             constant(
@@ -555,7 +555,7 @@ SECTIONS: Mapping[str, Section] = {
     "early": section(
         "AUC / DP at 20 px where the tracker's boxes are a frame early",
         scores_by_trace,
-        [constant(time, f"early, {time}").after(partial(shifted, frames=1)) for time in LATENCIES],
+        [constant(time).after(partial(shifted, frames=1)) for time in LATENCIES],
     ),
     "pvt++": Section(
         "RPN_mob with PVT++ on its Xavier, and forecasters on stand-ins' boxes: AUC at sigma = 0, "
@@ -579,7 +579,8 @@ stand-ins: other trackers, boxes of every frame, forecast from boxes alone; none
         mean_of_sequences,
     ),
     "closed-loop": Section(
-        "AUC / DP at 20 px of the tracker run live under constant times (assumed, not measured)",
+        "AUC / DP at 20 px of the tracker run live under constant times (assumed, not measured), "
+        "by what forecasts before it",
         closed_loops,
         mean_scores,
     ),

@@ -147,8 +147,8 @@ def test_sequences_with_frames_are_run_live_and_over_the_cameras_motion(
     live = figures.Arguments({}, ["kalman"], frames)
     rows = figures.closed_loops(live)
     printed = figures.mean_scores(rows, live)
-    assert "47ms, before: none " in printed
-    assert "100ms, before: kalman, size kept" in printed
+    assert "47ms, none " in printed
+    assert "100ms, kalman, size kept" in printed
     assert len(rows) == 2 * 2 * 2
 
     boxes = straight(12)
