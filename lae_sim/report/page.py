@@ -158,7 +158,8 @@ def _facts(view: View) -> dict[str, str]:
         **_search_facts(results),
         "initialisation": "; ".join(results.init_sources()),
         "uncertainty": "[ ]: 95 % percentile bootstrap over sequences, seed "
-        f"{results.plan.study.seed}",
+        f"{results.plan.study.seed}; p: Wilcoxon's signed-rank test, in the conclusion corrected "
+        "by Holm's method for the number of those compared with the best",
         "made with": f"lae_sim {__version__}",
     }
     made_up = [

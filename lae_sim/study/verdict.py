@@ -50,6 +50,7 @@ def verdict(summary: Sequence[SummaryRow], required: Sequence[Requirement] = ())
     if any(row.sigma == MEAN for row in rows):
         rows = [row for row in rows if row.sigma == MEAN]
     contests, names = _contests(rows), names_of(summary)
+    contests = sorted(contests, key=lambda each: not _is_alike(each.best, contests[0].best))
     where = _in_words([_setting(contest.best) for contest in contests])
     shown = len(contests) if len(contests) <= MOST_SETTINGS else MOST_SETTINGS - 1
     lines = [_sentence(*each, names) for each in zip(contests[:shown], where)]
@@ -87,6 +88,11 @@ def _setting(row: Row, dataset: str = "") -> dict[str, object]:
     """What a row's score depends on, beside tracker and forecaster."""
     own = {"scale": row.scale, "dataset": row.dataset} if isinstance(row, SummaryRow) else {}
     return {"dataset": dataset, **own, **{name: getattr(row, name) for name in SETTINGS}}
+
+
+def _is_alike(row: Row, first: Row) -> bool:
+    """Whether settings, scales apart, are those that the study names first."""
+    return all(getattr(row, name) == getattr(first, name) for name in SETTINGS)
 
 
 def _sentence(contest: _Contest, where: str, names: Names) -> str:
@@ -188,15 +194,20 @@ def _in_words(settings: Sequence[Mapping[str, object]]) -> list[str]:
         if value != settings[0][key] or (key == "scale" and value != 1)
     }
     return [
-        ", ".join(_part(key, value) for key, value in setting.items() if key in differ)
+        _joined({key: value for key, value in setting.items() if key in differ})
         for setting in settings
     ]
 
 
-def _part(key: str, value: object) -> str:
-    if isinstance(value, Fraction):
-        return f"in a world of {value} fps" if key == "fps" else _scale_in_words(value)
-    return f"{'on' if key == 'dataset' else 'with ' + key.replace('_', '-')} {visible(value)}"
+def _joined(setting: Mapping[str, object]) -> str:
+    """Scale, dataset and rate, then the names of what else there is."""
+    named = dict(setting)
+    scale, dataset, fps = (named.pop(key, None) for key in ("scale", "dataset", "fps"))
+    parts = [_scale_in_words(scale)] if isinstance(scale, Fraction) else []
+    parts += [f"on {visible(dataset)}"] if dataset is not None else []
+    parts += [f"in a world of {fps} fps"] if fps is not None else []
+    others = [f"{key.replace('_', '-')} {visible(value)}" for key, value in named.items()]
+    return ", ".join([*parts, *(["with " + ", ".join(others)] if others else [])])
 
 
 def _scale_in_words(scale: Fraction) -> str:
@@ -248,7 +259,9 @@ def _required_in_words(
     for row in required:
         setting = _setting(row, datasets.get(row.run, ""))
         rivals.setdefault((*setting.values(), row.required_auc), []).append(row)
-    groups = list(rivals.values())
+    groups = sorted(
+        rivals.values(), key=lambda rows: not _is_alike(rows[0], required[0])
+    )  # the first setting first
     where = _in_words([_setting(rows[0], datasets.get(rows[0].run, "")) for rows in groups])
     lines = [_slack(*each, names) for each in zip(groups[:MOST_REQUIRED], where)]
     if len(groups) > MOST_REQUIRED:

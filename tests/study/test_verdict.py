@@ -105,8 +105,8 @@ def test_scales_and_settings_are_said_where_they_tell_apart() -> None:
         "At the times as they are", "At twice the time", "At 1.5 times the time",
     ]  # fmt: skip
     lines = verdict([*setting(CLEAR), *setting(CLEAR, policy="fifo", fps=Fraction(60))])
-    assert lines[0].startswith("With policy latest, in a world of 30 fps, SiamFC with hold is best")
-    assert lines[1].startswith("With policy fifo, in a world of 60 fps, ")
+    assert lines[0].startswith("In a world of 30 fps, with policy latest, SiamFC with hold is best")
+    assert lines[1].startswith("In a world of 60 fps, with policy fifo, ")
     [one] = verdict(setting(CLEAR, scale=Fraction(1, 2)))
     assert one.startswith("At half the time, ")
     lines = verdict([*setting(CLEAR), *setting(CLEAR, dataset="E")])
