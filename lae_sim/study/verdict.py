@@ -46,12 +46,17 @@ def verdict(summary: Sequence[SummaryRow], required: Sequence[Requirement] = ())
     At most :data:`MOST_SETTINGS` and :data:`MOST_REQUIRED` of them. Scores are those of the
     ranking: of the first sigma, or means over the grid of them.
     """
-    rows = [row for row in summary if row.uncertainty]
+    rows = [row for row in summary if row.certainty("auc") and row.score("auc") is not None]
     if any(row.sigma == MEAN for row in rows):
         rows = [row for row in rows if row.sigma == MEAN]
     contests, names = _contests(rows), names_of(summary)
     contests = sorted(contests, key=lambda each: not _is_alike(each.best, contests[0].best))
     where = _in_words([_setting(contest.best) for contest in contests])
+    alike = Counter(where)  # where some traces of a setting have other sequences
+    where = [
+        f"{text}{', ' * bool(text)}on {each.best.sequences} sequences" if alike[text] > 1 else text
+        for each, text in zip(contests, where)
+    ]
     shown = len(contests) if len(contests) <= MOST_SETTINGS else MOST_SETTINGS - 1
     lines = [_sentence(*each, names) for each in zip(contests[:shown], where)]
     if others := contests[shown:]:
@@ -122,8 +127,8 @@ def _sentence(contest: _Contest, where: str, names: Names) -> str:
         parts.append(f"no difference shown: {said} ({_alike(alike)})")
     if behind:
         parts.append(f"{'next, ' * bool(alike)}{_pair(behind[0], names)} {_gap(behind[0])}")
-        runs = {best.run, *(row.run for row in alike), behind[0].run}
-        if another := next((row for row in behind if row.run not in runs), None):
+        trackers = {*map(_tracker, (best, *alike, behind[0]))}
+        if another := next((row for row in behind if _tracker(row) not in trackers), None):
             parts.append(f"the next tracker, {_pair(another, names)}, {_gap(another)}")
     if rival := _best_by_model(contest):
         assumed = (
@@ -134,6 +139,10 @@ def _sentence(contest: _Contest, where: str, names: Names) -> str:
             f"{_by_model(rival):.3f}"
         )
     return "; ".join(parts) + "."
+
+
+def _tracker(row: SummaryRow) -> str:
+    return row.run if row.tracker == "unknown" else row.tracker
 
 
 def _alike(alike: Sequence[SummaryRow]) -> str:
