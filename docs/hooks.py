@@ -15,7 +15,6 @@ from lae_sim.cli import main
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#|/)([^)#\s]+)(?=[)#\s])")
-COMMANDS = "<!-- commands -->"
 INCLUDE = re.compile(r'^--8<-- "(.+)"$', re.MULTILINE)
 
 
@@ -41,7 +40,10 @@ def copied(config: Any, uri: str, path: Path) -> File:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Put in what a page includes: other files, and the help of the commands."""
     markdown = included(markdown, page.file.src_uri)
-    return markdown.replace(COMMANDS, commands()) if COMMANDS in markdown else markdown
+    for mark, made in MADE.items():
+        if mark in markdown:
+            markdown = markdown.replace(mark, made())
+    return markdown
 
 
 def included(markdown: str, uri: str) -> str:
@@ -72,7 +74,7 @@ def commands() -> str:
 
 def command(parser: argparse.ArgumentParser) -> str:
     """The help of one command."""
-    formatter = argparse.HelpFormatter(parser.prog, width=88)
+    formatter = argparse.HelpFormatter(parser.prog, width=80)
     formatter.add_usage(parser.usage, parser._actions, parser._mutually_exclusive_groups)
     usage = formatter.format_help().strip()
     parts = [f"## {parser.prog}", plain(parser.description or ""), f"```text\n{usage}\n```"]
@@ -93,3 +95,18 @@ def command(parser: argparse.ArgumentParser) -> str:
 def plain(text: str) -> str:
     """Text in Markdown, none of whose signs mean anything."""
     return re.sub(r"([\\`*_\[\]<>|#])", r"\\\1", text)
+
+
+def rooms() -> str:
+    """The packages that hold the rest, each with what it is for and its names."""
+    found = []
+    for stub in sorted((REPOSITORY / "lae_sim").glob("*/__init__.pyi")):
+        module = importlib.import_module(f"lae_sim.{stub.parent.name}")
+        names = ", ".join(f"`{name}`" for name in module.__all__)
+        about = (module.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
+        found.append(f"`{module.__name__}`\n\n:   {about}\n\n    {names}")
+    return "\n\n".join(found)
+
+
+MADE = {"<!-- commands -->": commands, "<!-- rooms -->": rooms}
+"""What stands in place of marks in pages."""
