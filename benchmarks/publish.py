@@ -1,9 +1,9 @@
 """Writes what the benchmarks print into docs/results/speed.md: ``python benchmarks/publish.py``.
 
 It runs run.py, profiling.py and study.py, on an idle machine for half an hour, or takes what they
-printed before: ``--logs FOLDER`` with run.txt, profiling.txt and study.txt. On the page, each stands
-in the block after ``<!-- made by benchmarks/NAME.py -->``; the date, the machine and the versions
-in the paragraph after ``<!-- made by benchmarks/publish.py -->``.
+printed before: ``--logs FOLDER`` with run.txt, profiling.txt and study.txt. On the page each stands
+in the block after ``<!-- made by benchmarks/NAME.py -->``, and the date, the machine and the
+versions in the paragraph after ``<!-- made by benchmarks/publish.py -->``.
 """
 
 from __future__ import annotations
