@@ -1,4 +1,4 @@
-"""What pages list is complete: keys, conventions, forecasters; and the tests of invariants exist."""
+"""What pages list is complete: keys, conventions, forecasters; invariants name tests that exist."""
 
 from __future__ import annotations
 
