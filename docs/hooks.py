@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import posixpath
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from lae_sim.cli import main
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#|/)([^)#\s]+)(?=[)#\s])")
+MARK = re.compile(r"<!-- (commands|rooms|schema:) ?(.*?) ?-->")
 INCLUDE = re.compile(r'^--8<-- "(.+)"$', re.MULTILINE)
 
 
@@ -38,12 +41,10 @@ def copied(config: Any, uri: str, path: Path) -> File:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put in what a page includes: other files, and the help of the commands."""
-    markdown = included(markdown, page.file.src_uri)
-    for mark, made in MADE.items():
-        if mark in markdown:
-            markdown = markdown.replace(mark, made())
-    return markdown
+    """Put in what a page includes: other files, and what is made here in place of its marks."""
+    return MARK.sub(
+        lambda mark: MADE[mark[1]](*mark[2].split()), included(markdown, page.file.src_uri)
+    )
 
 
 def included(markdown: str, uri: str) -> str:
@@ -108,5 +109,69 @@ def rooms() -> str:
     return "\n\n".join(found)
 
 
-MADE = {"<!-- commands -->": commands, "<!-- rooms -->": rooms}
-"""What stands in place of marks in pages."""
+def schema(name: str) -> str:
+    """The keys of what a command prints as JSON, in a table of each kind of object."""
+    path = REPOSITORY / "docs" / "reference" / "schemas" / f"{name}.schema.json"
+    document = json.loads(path.read_text(encoding="utf-8"))
+    parts = [keys_of(document, name)]
+    for kind, each in document.get("$defs", {}).items():
+        parts += [
+            f"#### {kind} {{ #{name}-{kind} }}",
+            each["description"],
+            keys_of(each, name),
+        ]
+    return "\n\n".join(parts)
+
+
+def keys_of(schema: dict[str, Any], name: str) -> str:
+    """The table of an object's keys, those of objects within them after a dot."""
+
+    def rows(properties: dict[str, Any], before: str) -> Iterator[str]:
+        for key, value in properties.items():
+            yield f"| `{before}{key}` | {type_of(value, name)} | {plain(value['description'])} |"
+            inner = next((each for each in inside(value) if "properties" in each), None)
+            if inner is not None:
+                dots = (
+                    "[]."
+                    if value.get("type") == "array"
+                    else ".NAME."
+                    if "additionalProperties" in value
+                    else "."
+                )
+                yield from rows(inner["properties"], f"{before}{key}{dots}")
+
+    patterns = {f"/{key}/": value for key, value in schema.get("patternProperties", {}).items()}
+    properties = {**schema["properties"], **patterns}
+    return "\n".join(["| key | type | meaning |", "|---|---|---|", *rows(properties, "")])
+
+
+def inside(schema: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """A schema, its alternatives, and those of a list's items or an object's values."""
+    yield schema
+    more = schema.get("additionalProperties")
+    for each in [*schema.get("anyOf", []), schema.get("items"), more if more is not True else None]:
+        if each:
+            yield from inside(each)
+
+
+def type_of(schema: dict[str, Any], name: str) -> str:
+    """The type of a value in words; kinds of objects are linked."""
+    if "$ref" in schema:
+        file, _, kind = schema["$ref"].partition("#/$defs/")
+        return f"[{kind}](#{file.partition('.')[0] or name}-{kind})"
+    if "const" in schema or "enum" in schema:
+        return " or ".join(
+            f"`{json.dumps(each)}`" for each in schema.get("enum", [schema.get("const")])
+        )
+    if "anyOf" in schema:
+        return " or ".join(type_of(each, name) for each in schema["anyOf"])
+    if schema.get("type") == "array":
+        return f"list of {type_of(schema['items'], name)}" if "items" in schema else "list"
+    if isinstance(schema.get("additionalProperties"), dict):
+        return f"object of {type_of(schema['additionalProperties'], name)} by name"
+    types = schema.get("type", "any")
+    return " or ".join([types] if isinstance(types, str) else types)
+
+
+MADE = {"commands": commands, "rooms": rooms, "schema:": schema}
+"""What stands in place of a mark, by its first word; the others are its arguments."""
