@@ -9,6 +9,8 @@ import pytest
 from pages import PAGES, PageError, name_of, rewritten, run_page
 from places import REPOSITORY
 
+import lae_sim
+
 GOOD = """
 # A page
 
@@ -122,3 +124,9 @@ def test_links_of_the_readme_lead_to_files_and_headings() -> None:
 def slug(heading: str) -> str:
     """The anchor that Markdown's toc, and GitHub alike, makes of a heading of plain words."""
     return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower())
+
+
+def test_every_name_of_the_package_is_in_the_reference() -> None:
+    page = (REPOSITORY / "docs" / "reference" / "api.md").read_text()
+    named = re.findall(r"^::: lae_sim\.(\w+)$", page, re.M)
+    assert sorted(named) == sorted(lae_sim.__all__)

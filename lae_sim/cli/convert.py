@@ -41,17 +41,6 @@ examples:
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``lae-sim convert``; see ``--help``."""
-    arguments = parser().parse_args(argv)
-    return exit_status(
-        lambda: _convert(arguments),
-        "lae-sim convert",
-        arguments.max_decoded,
-        prints_result=False,
-    )
-
-
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = new_parser(
@@ -110,6 +99,17 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--json", action="store_true", help="print the summary as JSON")
     return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status is 2 for bad input."""
+    arguments = parser().parse_args(argv)
+    return exit_status(
+        lambda: _convert(arguments),
+        "lae-sim convert",
+        arguments.max_decoded,
+        prints_result=False,
+    )
 
 
 def _convert(arguments: argparse.Namespace) -> None:

@@ -21,7 +21,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = new_parser(
         "lae-sim show",
-        "Say what a trace holds, and how its processing times are distributed; of a gap pass "
+        "Say what a trace holds, and how its processing times are distributed; of a gap pass\n"
         "(lae-sim profile --gaps), what the tracker's reach is.",
         _EXAMPLES,
     )
@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``lae-sim show``; see ``--help``."""
+    """Run the command; the exit status is 2 for bad input."""
     arguments = parser().parse_args(argv)
     return exit_status(lambda: _show(arguments), "lae-sim show", arguments.max_decoded)
 
