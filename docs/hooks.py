@@ -17,7 +17,7 @@ from lae_sim.cli import main
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#|/)([^)#\s]+)(?=[)#\s])")
-MARK = re.compile(r"<!-- (commands|rooms|schema:) ?(.*?) ?-->")
+MARK = re.compile(r"<!-- (commands|rooms|schemas) -->")
 INCLUDE = re.compile(r'^--8<-- "(.+)"$', re.MULTILINE)
 
 
@@ -42,9 +42,7 @@ def copied(config: Any, uri: str, path: Path) -> File:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Put in what a page includes: other files, and what is made here in place of its marks."""
-    return MARK.sub(
-        lambda mark: MADE[mark[1]](*mark[2].split()), included(markdown, page.file.src_uri)
-    )
+    return MARK.sub(lambda mark: MADE[mark[1]](), included(markdown, page.file.src_uri))
 
 
 def included(markdown: str, uri: str) -> str:
@@ -109,17 +107,18 @@ def rooms() -> str:
     return "\n\n".join(found)
 
 
-def schema(name: str) -> str:
-    """The keys of what a command prints as JSON, in a table of each kind of object."""
-    path = REPOSITORY / "docs" / "reference" / "schemas" / f"{name}.schema.json"
-    document = json.loads(path.read_text(encoding="utf-8"))
-    parts = [keys_of(document, name)]
-    for kind, each in document.get("$defs", {}).items():
-        parts += [
-            f"#### {kind} {{ #{name}-{kind} }}",
-            each["description"],
-            keys_of(each, name),
-        ]
+def schemas() -> str:
+    """The keys of what each command prints as JSON, in a table of each kind of object."""
+    folder = REPOSITORY / "docs" / "reference" / "schemas"
+    parts = []
+    for path in sorted(folder.glob("*.schema.json")):
+        name = path.name.partition(".")[0]
+        document = json.loads(path.read_text(encoding="utf-8"))
+        link = f"[{path.name}](schemas/{path.name})"
+        parts += [f"## {name}", f"{plain(document['title'])}: {link}", keys_of(document, name)]
+        for kind, each in document.get("$defs", {}).items():
+            title = f"#### {kind} {{ #{name}-{kind} }}"
+            parts += [title, plain(each.get("description", "")), keys_of(each, name)]
     return "\n\n".join(parts)
 
 
@@ -129,16 +128,13 @@ def keys_of(schema: dict[str, Any], name: str) -> str:
     def rows(properties: dict[str, Any], before: str) -> Iterator[str]:
         for key, value in properties.items():
             yield f"| `{before}{key}` | {type_of(value, name)} | {plain(value['description'])} |"
-            inner = next((each for each in inside(value) if "properties" in each), None)
-            if inner is not None:
-                dots = (
-                    "[]."
-                    if value.get("type") == "array"
-                    else ".NAME."
-                    if "additionalProperties" in value
-                    else "."
-                )
-                yield from rows(inner["properties"], f"{before}{key}{dots}")
+            for each in inside(value):
+                if "properties" in each:
+                    yield from rows(each["properties"], f"{before}{key}{step(value)}")
+
+    def step(value: dict[str, Any]) -> str:
+        named = "additionalProperties" in value
+        return "[]." if value.get("type") == "array" else ".NAME." if named else "."
 
     patterns = {f"/{key}/": value for key, value in schema.get("patternProperties", {}).items()}
     properties = {**schema["properties"], **patterns}
@@ -158,7 +154,8 @@ def type_of(schema: dict[str, Any], name: str) -> str:
     """The type of a value in words; kinds of objects are linked."""
     if "$ref" in schema:
         file, _, kind = schema["$ref"].partition("#/$defs/")
-        return f"[{kind}](#{file.partition('.')[0] or name}-{kind})"
+        about = file.partition(".")[0] or name
+        return f"[{kind}](#{about}-{kind})" if kind else f"[{about}](#{about})"
     if "const" in schema or "enum" in schema:
         return " or ".join(
             f"`{json.dumps(each)}`" for each in schema.get("enum", [schema.get("const")])
@@ -173,5 +170,5 @@ def type_of(schema: dict[str, Any], name: str) -> str:
     return " or ".join([types] if isinstance(types, str) else types)
 
 
-MADE = {"commands": commands, "rooms": rooms, "schema:": schema}
-"""What stands in place of a mark, by its first word; the others are its arguments."""
+MADE = {"commands": commands, "rooms": rooms, "schemas": schemas}
+"""What stands in place of a mark, by its name."""
