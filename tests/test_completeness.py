@@ -61,6 +61,13 @@ def test_a_table_has_a_row_for_each(name: str, listed: list[str]) -> None:
     assert set(listed) - first == set()
 
 
+def test_every_room_is_described() -> None:
+    text = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rooms = {path.parent.name for path in REPOSITORY.glob("lae_sim/*/__init__.py")}
+    assert rooms
+    assert [room for room in sorted(rooms) if f"`{room}/`" not in text] == []
+
+
 def test_every_format_of_results_is_described() -> None:
     described = page("howto/results.md").lower()
     signs = {"ope": "plain text", "mat": "`.mat`", "json": "`.json`", "npz": "`.npz`"}
