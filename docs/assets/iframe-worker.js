@@ -1,2 +1,49 @@
-/*! iframe-worker 1.0.4, (c) 2020-2022 Martin Donath, MIT licence: https://github.com/squidfunk/iframe-worker */
-"use strict";(()=>{function c(s,n){parent.postMessage(s,n||"*")}function d(...s){return s.reduce((n,e)=>n.then(()=>new Promise(r=>{let t=document.createElement("script");t.src=e,t.onload=r,document.body.appendChild(t)})),Promise.resolve())}var o=class extends EventTarget{constructor(e){super();this.url=e;this.m=e=>{e.source===this.w&&(this.dispatchEvent(new MessageEvent("message",{data:e.data})),this.onmessage&&this.onmessage(e))};this.e=(e,r,t,i,m)=>{if(r===`${this.url}`){let a=new ErrorEvent("error",{message:e,filename:r,lineno:t,colno:i,error:m});this.dispatchEvent(a),this.onerror&&this.onerror(a)}};let r=document.createElement("iframe");r.hidden=!0,document.body.appendChild(this.iframe=r),this.w.document.open(),this.w.document.write(`<html><body><script>postMessage=${c};importScripts=${d};addEventListener("error",({error})=>{parent.dispatchEvent(new ErrorEvent("error",{filename:"${e}",error}))})<\/script><script src=${e}?${+Date.now()}><\/script></body></html>`),this.w.document.close(),onmessage=this.m,onerror=this.e,this.r=new Promise((t,i)=>{this.w.onload=t,this.w.onerror=i})}terminate(){this.iframe.remove(),onmessage=onerror=null}postMessage(e){this.r.catch().then(()=>{this.w.dispatchEvent(new MessageEvent("message",structuredClone({data:e})))})}get w(){return this.iframe.contentWindow}};window.IFrameWorker=o;location.protocol==="file:"&&(window.Worker=o);})();
+// Browsers refuse workers under file://. There the search's worker runs in a hidden frame instead,
+// which has what a worker's script asks of its global object: importScripts, postMessage, messages.
+"use strict";
+if (location.protocol === "file:") {
+  const shim = `
+    window.postMessage = (data) => parent.postMessage({ frame: name, data }, "*");
+    window.importScripts = async (...urls) => {
+      for (const url of urls)
+        await new Promise((loaded, failed) => {
+          const script = document.createElement("script");
+          Object.assign(script, { src: url, onload: loaded, onerror: failed });
+          document.head.append(script);
+        });
+    };
+    addEventListener("told", (event) =>
+      dispatchEvent(new MessageEvent("message", { data: event.detail })));`;
+  let workers = 0;
+  window.Worker = class extends EventTarget {
+    constructor(url) {
+      super();
+      const name = `worker-${workers++}`;
+      this.frame = Object.assign(document.createElement("iframe"), { name, hidden: true });
+      document.body.append(this.frame);
+      const inside = this.frame.contentDocument;
+      inside.write("<!doctype html><head></head>");
+      inside.close();
+      this.ready = new Promise((loaded) => {
+        inside.head.append(Object.assign(inside.createElement("script"), { text: shim }));
+        const work = inside.createElement("script");
+        Object.assign(work, { src: url, onload: loaded });
+        inside.head.append(work);
+      });
+      addEventListener("message", ({ data }) => {
+        if (data?.frame !== name) return;
+        const event = new MessageEvent("message", { data: data.data });
+        this.dispatchEvent(event);
+        this.onmessage?.(event);
+      });
+    }
+    async postMessage(data) {
+      await this.ready;
+      const view = this.frame.contentWindow;
+      view.dispatchEvent(new view.CustomEvent("told", { detail: data }));
+    }
+    terminate() {
+      this.frame.remove();
+    }
+  };
+}
