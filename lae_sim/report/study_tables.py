@@ -360,8 +360,8 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
         ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
         ...     )
         ...     lae_sim.write_tables(results, f"{folder}/paper")
-        ...     sorted(name for name in os.listdir(f"{folder}/paper") if name.endswith("e.tex"))
-        ['ranking.tex', 'table2.tex']
+        ...     sorted(name for name in os.listdir(f"{folder}/paper") if "table2" in name)
+        ['table2-long.tex', 'table2.csv', 'table2.parquet', 'table2.tex']
     """
     view = results if isinstance(results, View) else View(results)
     try:
