@@ -130,7 +130,9 @@ def test_what_cannot_be_the_folder_is_told_before_the_work(tmp_path: Path, comma
     (tmp_path / "notes").write_text("mine")
     done = run_here(command, SLOW, "--out", tmp_path / "notes")
     assert done.returncode == 2
-    assert "notes: is there already and is not a folder: name another" in done.stderr
+    assert "notes: name a folder" in done.stderr
     done = run_here(command, SLOW, "--root", tmp_path, "--out", tmp_path)
-    assert "the frames are read from there: name another folder" in done.stderr
+    assert "would replace a file that is read" in done.stderr
+    done = run_here(command, SLOW, "--out", tmp_path / "scores.txt")
+    assert "scores.txt: name a folder" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["notes"]
