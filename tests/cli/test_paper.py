@@ -43,9 +43,10 @@ def test_replay_writes_figures_tables_and_everything_it_knows(tmp_path: Path) ->
         tables = {"table2", "attributes", "scores", "sequences"}
         assert names(files, "tables", kind) == tables
     printed, kept = json.loads(done.stdout), json.loads(files["replay.json"])
-    assert len(kept["traces"][0]["results"][0].pop("per_sequence")) == 2
     [trace] = kept["traces"]
     assert trace["results"][0]["auc"] == printed["traces"][0]["results"][0]["auc"]
+    sequences = pd.read_parquet(tmp_path / "paper" / "tables" / "sequences.parquet")
+    assert len(sequences) == 2 * len(trace["results"])
     scores = pd.read_parquet(tmp_path / "paper" / "tables" / "scores.parquet")
     assert scores["auc"].tolist() == [result["auc"] for result in trace["results"]]
     assert scores["scale"].dtype == scores["fps"].dtype == "float64"
@@ -101,6 +102,14 @@ def test_compare_over_the_grid_draws_each_sigma(tmp_path: Path) -> None:
     figures = names(files, "figures", "svg")
     assert {"mauc-synthetic-slow", "auc-over-sigma-synthetic-slow-recorded"} < figures
     assert b"mAUC & mDP" in files["tables/table2.tex"]
+
+
+def test_hold_alone_recovers_nothing_that_could_be_drawn(tmp_path: Path) -> None:
+    words = ("compare", SLOW, *FEW, "--forecaster", "hold", "--out", tmp_path / "paper")
+    assert run_here(*words).returncode == 0
+    figures = names(files_in(tmp_path / "paper"), "figures", "pdf")
+    assert not [name for name in figures if name.startswith("recovered")]
+    assert "attributes-auc-synthetic-slow-recorded" in figures
 
 
 def test_a_study_writes_figures_and_takes_old_ones_away(tmp_path: Path) -> None:
