@@ -414,7 +414,7 @@ class EvaluationResult:
         """
         from lae_sim.report.paper import Paper, write_paper
 
-        document = self.document(attributes=True, per_sequence=True)
+        document = self.document(attributes=True)
         write_paper(
             Paper(
                 figures_for_paper(self.parts),

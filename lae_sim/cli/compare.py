@@ -175,12 +175,9 @@ def _compare(arguments: argparse.Namespace) -> None:
 
 def _check_files(arguments: argparse.Namespace, traces: Sequence[str]) -> None:
     """Refuse what would only fail after the work."""
-    outputs = [arguments.plot]
+    check_outputs(arguments, [arguments.out, arguments.plot], traces)
     if arguments.out and _is_folder(arguments.out):
-        check_folder(arguments, arguments.out, ", or a .csv or .parquet file")
-    else:
-        outputs.append(arguments.out)
-    check_outputs(arguments, outputs, traces)
+        check_folder(arguments.out, ", or a .csv or .parquet file")
     if arguments.plot:
         from lae_sim.figures.style import check_format
 

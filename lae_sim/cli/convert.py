@@ -41,24 +41,14 @@ examples:
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``lae-sim convert``; see ``--help``."""
-    arguments = _parser().parse_args(argv)
-    return exit_status(
-        lambda: _convert(arguments),
-        "lae-sim convert",
-        arguments.max_decoded,
-        prints_result=False,
-    )
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = new_parser(
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = new_parser(
         "lae-sim convert",
         "Make a trace from a tracker's results and the dataset's ground truth.",
         _EXAMPLES,
     )
-    add = parser.add_argument
+    add = made.add_argument
     add("results", type=Path, metavar="RESULTS", help="folder of one tracker's results, or a file")
     add("--truth", type=Path, required=True, metavar="ROOT", help="the dataset's folder")
     add("--out", type=Path, required=True, metavar="TRACE", help="the trace to write (.parquet)")
@@ -108,7 +98,18 @@ def _parser() -> argparse.ArgumentParser:
         help="replace a trace of another tracker or dataset, or what is no trace",
     )
     add("--json", action="store_true", help="print the summary as JSON")
-    return parser
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status is 2 for bad input."""
+    arguments = parser().parse_args(argv)
+    return exit_status(
+        lambda: _convert(arguments),
+        "lae-sim convert",
+        arguments.max_decoded,
+        prints_result=False,
+    )
 
 
 def _convert(arguments: argparse.Namespace) -> None:
@@ -149,11 +150,12 @@ def _convert(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json(summary.document(arguments.out))
     else:
-        print_text(_text(summary, arguments.out))
+        next_step = f"Next: lae-sim replay {arguments.out}"
+        print_text("\n".join([*lines_of(summary, arguments.out), next_step]))
 
 
-def _text(summary: ConversionSummary, out: Path) -> str:
-    """The summary for people."""
+def lines_of(summary: ConversionSummary, out: Path) -> list[str]:
+    """The summary of the conversion to a trace, for people."""
     from lae_sim.datasets.dropped import note
 
     processed = "every frame"
@@ -191,7 +193,7 @@ def _text(summary: ConversionSummary, out: Path) -> str:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:
         lines.append(f"Without results: {listed(summary.without_results)}.")
-    return "\n".join([*lines, f"Next: lae-sim replay {out}"])
+    return lines
 
 
 def _milliseconds(ms: float) -> str:

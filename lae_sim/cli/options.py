@@ -379,31 +379,21 @@ def check_outputs(
     check_places(path for path in written if not os.path.isdir(path))
 
 
-def check_folder(arguments: argparse.Namespace, folder: str, or_else: str = "") -> None:
+def check_folder(folder: str, or_else: str = "") -> None:
     """Refuse, before the work, a folder that figures and tables cannot be written to.
 
     Args:
-        arguments: which say what is read.
-        folder: the folder.
+        folder: the folder, one of those that :func:`check_outputs` looked at.
         or_else: what else could be named.
 
     Raises:
-        LaeError: if it is a file, or called like one, or one that is read, or cannot be written to.
+        LaeError: if it is a file, or called like one, or cannot be written to.
     """
-    if os.path.splitext(folder)[1] and not os.path.isdir(folder):
-        raise LaeError(
-            f"--out {folder}: name a folder{or_else}; that of a folder with a point in it ends in /"
-        )
-    root = getattr(arguments, "root", None)
-    if os.path.exists(folder) and not os.path.isdir(folder):
-        raise LaeError(f"--out {folder}: is there already and is not a folder: name another")
-    if root and os.path.isdir(folder) and os.path.samefile(folder, root):
-        raise LaeError(f"--out {folder}: the frames are read from there: name another folder")
-    above = os.path.realpath(folder)
-    while not os.path.isdir(above):
-        above = os.path.dirname(above)
-    if not os.access(above, os.W_OK):
-        raise LaeError(f"--out {folder}: {above} cannot be written to: name another folder")
+    if os.path.isdir(folder):
+        if not os.access(folder, os.W_OK):
+            raise LaeError(f"--out {folder}: it cannot be written to: name another folder")
+    elif os.path.exists(folder) or os.path.splitext(folder)[1]:
+        raise LaeError(f"--out {folder}: name a folder (NAME.WITH.POINTS/ ends in /){or_else}")
 
 
 def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]:

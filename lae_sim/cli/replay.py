@@ -209,10 +209,10 @@ def _check_files(arguments: argparse.Namespace, swept: Sequence[str]) -> None:
         raise LaeError(f"--{asked[0]} takes one frame rate and one scale of the times at a time")
     if arguments.strided and len(arguments.traces) > 1:
         raise LaeError("--strided goes with one trace at a time")
-    outputs = [*(getattr(arguments, name) for name in _FILES), arguments.plot]
+    outputs = [*(getattr(arguments, name) for name in _FILES), arguments.plot, arguments.out]
     check_outputs(arguments, outputs, arguments.traces)
     if arguments.out is not None:
-        check_folder(arguments, arguments.out)
+        check_folder(arguments.out)
 
 
 def _observers(

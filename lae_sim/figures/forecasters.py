@@ -131,13 +131,19 @@ def comparison_in_columns(summary: pd.DataFrame, metrics: Sequence[str]) -> Iter
                 f"{_label(metric)} of forecasters on {trace}, with 95 % intervals over sequences",
                 column_figure(partial(draw, rows=rows)),
             )
-            if metric == metrics[0] and rows["recovered"].notna().any():
+            if metric == metrics[0] and recovers(rows):
                 yield ColumnFigure(
                     f"recovered-{metric}-{trace}",
                     f"Share of the {_label(metric)} lost to latency that forecasters recover on "
                     f"{trace}, with 95 % intervals over sequences",
                     column_figure(partial(_draw_all_shares, rows, settings, styles)),
                 )
+
+
+def recovers(rows: pd.DataFrame) -> bool:
+    """Whether there is a forecaster whose share of the loss is known."""
+    rivals = rows[~rows["forecaster"].isin(["hold", "offline"])]
+    return bool(rivals["recovered"].notna().any())
 
 
 def sweeps_in_columns(summary: pd.DataFrame, metrics: Sequence[str]) -> Iterator[ColumnFigure]:
@@ -316,14 +322,10 @@ def attributes_in_columns(
     first = summary[summary["sigma"] == summary["sigma"].min()]
     chosen, groups = _attribute_groups(first, metric)
     styles, attributes = _styles(chosen), _attribute_counts(chosen)
-    value: Literal["recovered", "mean"] = (
-        "recovered" if chosen["recovered"].notna().any() else "mean"
-    )
-    what = (
-        f"share of the {_label(metric)} lost that is recovered"
-        if value == "recovered"
-        else _label(metric)
-    )
+    value: Literal["recovered", "mean"] = "recovered" if recovers(chosen) else "mean"
+    what = _label(metric)
+    if value == "recovered":
+        what = f"share of the {what} lost that is recovered"
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         _draw_bars(axes, rows, attributes, styles, metric, value, _HATCHES)

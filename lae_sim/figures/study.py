@@ -18,7 +18,7 @@ from lae_sim.comparison.statistics import ALL_TRACES, Interval
 from lae_sim.engine.clock import parse_duration, split_init
 from lae_sim.errors import visible
 from lae_sim.figures.column import ColumnFigure, column_figure
-from lae_sim.figures.forecasters import attribute_bars, attributes_in_columns
+from lae_sim.figures.forecasters import attribute_bars, attributes_in_columns, recovers
 from lae_sim.figures.lines import (
     Curve,
     Line,
@@ -421,7 +421,7 @@ def _dot(
 def attributes(view: View) -> Iterator[Picture]:
     """Gains on the sequences of each attribute, all trackers of a dataset together."""
     for dataset, rows in _attribute_rows(view):
-        is_recovered = rows["recovered"].notna().any()
+        is_recovered = recovers(rows)
         what = "share of the latency loss recovered" if is_recovered else "AUC"
         yield Picture(
             f"{dataset}: {what} on the sequences of each attribute (n of them), with 95 % "

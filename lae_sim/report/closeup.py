@@ -195,7 +195,9 @@ class CloseUp:
     def boxes(self) -> dict[str, Sequence[float] | None]:
         """The boxes at the start, the truth and those of forecasters; None if there is none."""
         found = {"truth": self.run.recording.truth, **{n: a.boxes for n, a in self.answers.items()}}
-        return {name: _plain(boxes[self.start : self.start + 1])[0] for name, boxes in found.items()}
+        return {
+            name: _plain(boxes[self.start : self.start + 1])[0] for name, boxes in found.items()
+        }
 
     def document(self) -> str:
         """What the script of the page shows of each frame, as JSON."""
@@ -236,8 +238,8 @@ def _bars(starts: Floats, lengths: Floats) -> str:
 
 def _plain(boxes: Floats) -> list[Any]:
     """Boxes as JSON holds them; None if there is none."""
-    known = np.isfinite(boxes).all(axis=1)
-    return [row if ok else None for row, ok in zip(np.round(boxes, 1).tolist(), known.tolist())]
+    known = np.isfinite(boxes.sum(axis=1)).tolist()
+    return [row if ok else None for row, ok in zip(np.round(boxes, 1).tolist(), known)]
 
 
 def close_ups(
@@ -271,7 +273,9 @@ def close_ups(
     try:
         with explained("failed"):
             trace = held(read_trace(setting.trace.path, tuple(chosen)))
-            runs = {run.recording.name: run for _, run in reversed([*replayed(setting, trace).runs])}
+            runs = {
+                run.recording.name: run for _, run in reversed([*replayed(setting, trace).runs])
+            }
             costs = {cell.forecaster: cell.cost_ns for cell in view.results.plan.cells}
             sigma = setting.world.sigmas[0]
             answered = {
@@ -324,7 +328,7 @@ def _chosen(view: View, of_run: Mapping[str, Scores], forecaster: str) -> dict[s
     gains = aucs(forecaster) - (0 if forecaster == "hold" else aucs("hold"))
     order = [s for s in np.argsort(-gains, kind="stable").tolist() if np.isfinite(gains[s])]
     what = "AUC {:.3f}" if forecaster == "hold" else f"AUC {{:+.3f}} from hold to {forecaster}"
-    found = {}
+    found: dict[str, str] = {}
     for place, words in ((0, "the most"), (-1, "the least"), (len(order) // 2, "the median")):
         if order:
             s = order[place]

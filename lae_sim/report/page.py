@@ -1,8 +1,8 @@
 """The report of a study: one HTML page that needs nothing else.
 
-It can be read without its script, which sorts tables, chooses their columns, saves figures and moves
-through sequences. The template escapes all text, and the page's own policy lets no other script run
-and nothing be fetched.
+It can be read without its script, which sorts tables, chooses their columns, saves figures and
+moves through sequences. The template escapes all text, and the page's own policy lets no other
+script run and nothing be fetched.
 """
 
 from __future__ import annotations
@@ -149,7 +149,9 @@ def page(view: View, root: str | os.PathLike[str] | None = None) -> str:
 def _dark_figures(sections: Iterable[Section]) -> str:
     """The rule of CSS that makes the colours of figures those of a dark page."""
     pictures = (picture.svg.decode() for section in sections for picture in section.pictures)
-    colours = (" ".join(each.colours.values()) for section in sections for each in section.close_ups)
+    colours = (
+        " ".join(each.colours.values()) for section in sections for each in section.close_ups
+    )
     variables = {**dark_colours([BLUE, VERMILION]), **dark_colours([*pictures, *colours])}
     return f":root {{ {'; '.join(f'{name}: {colour}' for name, colour in variables.items())} }}"
 
@@ -182,7 +184,8 @@ def _facts(view: View) -> dict[str, str]:
         **_search_facts(results),
         "initialisation": "; ".join(results.init_sources()),
         "uncertainty": "[ ]: 95 % percentile bootstrap over sequences, seed "
-        f"{results.plan.study.seed}",
+        f"{results.plan.study.seed}; p: Wilcoxon's signed-rank test, in the conclusion corrected "
+        "by Holm's method for the number of those compared with the best",
         "made with": f"lae_sim {__version__}",
     }
     made_up = [

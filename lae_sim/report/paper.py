@@ -25,6 +25,7 @@ from lae_sim.report.latex import latex_of
 from lae_sim.report.table import (
     CHANGE,
     SCORE,
+    UNKNOWN,
     Cell,
     Column,
     Table,
@@ -330,7 +331,8 @@ def with_and_without(
         f"is bold, the second underlined; {setting}",
     )
     places = [c for c, column in enumerate(table.columns) if column.form is SCORE]
-    return replace(table, rows=_with_ranks(table.rows, places))
+    known = [row for row in table.rows if any(row[c] != UNKNOWN for c in places)]
+    return replace(table, rows=_with_ranks(known, places))
 
 
 _CHANGES = ": hold changes relative to offline, forecasters relative to hold"

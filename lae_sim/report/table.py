@@ -190,7 +190,7 @@ class Table:
 
     @property
     def minor(self) -> set[int]:
-        """The places of the columns that need not be seen: unimportant, or the same label always."""
+        """The places of columns that need not be seen: unimportant, or of one label alone."""
         return {
             place
             for place, column in enumerate(self.columns)

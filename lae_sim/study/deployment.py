@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -26,7 +27,7 @@ MOST = 1 << 13
 FINE = 10
 """Scales that are tried between two coarse ones, at most, where only one of them is enough."""
 
-_GROWTH = 1.1  # of the coarse scales
+_GROWTH = 1.15  # of the coarse scales
 _RELATIVE = ("latest", "fifo", "every")  # policies that know no absolute times
 
 HELD = 1_000_000
@@ -112,10 +113,10 @@ def scan(auc: Callable[[int], float], required: Sequence[Fraction]) -> dict[int,
     """The AUC at scales in hundredths, by scale, ascending; dense where it crosses what is asked.
 
     No order is assumed: stalls, and calls that come into step with the camera, make the AUC rise
-    with slower times. Coarse scales are tried, each a tenth above the one before, up to twice the
-    last that is enough; between two of which one only is enough, `FINE` in an even distance; and
-    each change between these is followed to the hundredth. (What comes and goes between two coarse
-    scales is not seen.)
+    with slower times. Those are tried that bisection would (:func:`bisected`); coarse scales, each
+    some 15 % above the one before, up to twice the last that is enough; between two of which one
+    only is enough, `FINE` in an even distance; and each change between these is followed to the
+    hundredth. (What comes and goes between two coarse scales is not seen.)
     """
     known: dict[int, float] = {}
 
@@ -124,6 +125,8 @@ def scan(auc: Callable[[int], float], required: Sequence[Fraction]) -> dict[int,
             known[step] = auc(step)
         return known[step] >= least
 
+    for least in required:
+        bisected(partial(enough, least=least))
     last = round(1 / STEP)
     for step in _coarse():
         if enough(step, min(required)):
@@ -150,9 +153,27 @@ def scan(auc: Callable[[int], float], required: Sequence[Fraction]) -> dict[int,
     return dict(sorted(known.items()))
 
 
+def bisected(enough: Callable[[int], bool]) -> tuple[int | None, int | None]:
+    """The last scale that is enough and the hundredth after, as if none after it were.
+
+    None for the first where no latency at all is not enough, for the second where the largest is.
+    """
+    if not enough(0):
+        return None, 0
+    low, high = 0, 1
+    while enough(high) and high < MOST:
+        low, high = high, 2 * high
+    if enough(high):
+        return high, None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    return low, high
+
+
 def _coarse() -> list[int]:
     """0, and scales in hundredths from 0.01 to the largest, 1 among them."""
-    steps = [round(100 * _GROWTH**k) for k in range(-23, 47)]
+    steps = [round(100 * _GROWTH**k) for k in range(-16, 32)]
     return [0, 1, *(step for step in steps if step < MOST), MOST]
 
 
@@ -195,11 +216,10 @@ def requirement(search: Search, curve: Curve, required: Fraction) -> Requirement
     the recorded motion from frame to frame (but for the rounding to whole ns).
     """
     setting = search.cell.setting
-    scales = [step * STEP for step in curve.steps]
+    scales, auc = [step * STEP for step in curve.steps], dict(zip(curve.steps, curve.auc))
     stretches = curve.stretches(required)
-    last = stretches[-1][1] if stretches else None
-    beyond = 0 if last is None else last + 1 if last + 1 < len(scales) else None
-    scale = None if last is None else scales[last]
+    last, beyond = bisected(lambda step: auc[step] >= required)
+    scale = None if last is None else last * STEP
     safe = _nearest(stretches, scales)
     relative = search.cell.cost_ns == 0 and setting.policy.split(":")[0] in _RELATIVE
     return Requirement(
@@ -215,9 +235,9 @@ def requirement(search: Search, curve: Curve, required: Fraction) -> Requirement
         sigma=setting.world.sigmas[0],
         required_auc=float(required),
         scale=scale,
-        auc=None if last is None else curve.auc[last],
-        beyond=None if beyond is None else scales[beyond],
-        beyond_auc=None if beyond is None else curve.auc[beyond],
+        auc=None if last is None else auc[last],
+        beyond=None if beyond is None else beyond * STEP,
+        beyond_auc=None if beyond is None else auc[beyond],
         auc_without_latency=curve.auc[0],
         speed_up=None if not scale else float(1 / scale),
         fps_at_most=float(scale * setting.fps) if scale is not None and relative else None,

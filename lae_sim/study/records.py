@@ -303,8 +303,8 @@ class Requirement(Record):
         trace, times_from, policy, fps, latency, search, pre_forecaster, convention, forecaster,
             sigma: where it is asked.
         required_auc: the mean AUC.
-        scale: the largest scale of all times, of those tried in hundredths, at which it is reached;
-            None if it is not even without latency.
+        scale: the scale of all times, in hundredths, at which bisection ends, as if the AUC fell
+            steadily (as version 0.1 has it); None if it is not even reached without latency.
         auc: the mean AUC there.
         beyond: the hundredth after it; None if the largest that is tried is enough.
         beyond_auc: the mean AUC there, too low.
@@ -315,7 +315,7 @@ class Requirement(Record):
         ranked_by: whose AUC it is, ``"modelled"`` or ``"recorded"``.
         safe_scale: the scale up to which times may be stretched from 1 on and the AUC is reached at
             every scale tried on the way; where it is not at 1, the largest below at which it is.
-            It is `scale` wherever the AUC falls steadily, and at most that.
+            It is `scale` wherever the AUC falls steadily.
         safe_auc, next_auc: the mean AUC there, and one hundredth after.
         safe_ms_per_frame: mean time of a call there, the initialisations apart; None without a
             call, and where only no latency at all is enough.

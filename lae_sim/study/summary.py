@@ -221,7 +221,7 @@ def summarise_study(
             row = replace(row, ranked_by=rankings[each.group].by)
             rival = (*each.group, each.sequences, each.forecaster, row.sigma)
             rivals.setdefault(rival, []).append(len(rows))
-            if row.uncertainty:
+            if row.certainty("auc") and row.score("auc") is not None:
                 rank = (*each.group, each.sequences, row.sigma)
                 ranks.setdefault(rank, []).append((len(rows), each))
             rows.append(row)

@@ -46,11 +46,17 @@ def verdict(summary: Sequence[SummaryRow], required: Sequence[Requirement] = ())
     At most :data:`MOST_SETTINGS` and :data:`MOST_REQUIRED` of them. Scores are those of the
     ranking: of the first sigma, or means over the grid of them.
     """
-    rows = [row for row in summary if row.uncertainty]
+    rows = [row for row in summary if row.certainty("auc") and row.score("auc") is not None]
     if any(row.sigma == MEAN for row in rows):
         rows = [row for row in rows if row.sigma == MEAN]
     contests, names = _contests(rows), names_of(summary)
+    contests = sorted(contests, key=lambda each: not _is_alike(each.best, contests[0].best))
     where = _in_words([_setting(contest.best) for contest in contests])
+    alike = Counter(where)  # where some traces of a setting have other sequences
+    where = [
+        f"{text}{', ' * bool(text)}on {each.best.sequences} sequences" if alike[text] > 1 else text
+        for each, text in zip(contests, where)
+    ]
     shown = len(contests) if len(contests) <= MOST_SETTINGS else MOST_SETTINGS - 1
     lines = [_sentence(*each, names) for each in zip(contests[:shown], where)]
     if others := contests[shown:]:
@@ -89,6 +95,11 @@ def _setting(row: Row, dataset: str = "") -> dict[str, object]:
     return {"dataset": dataset, **own, **{name: getattr(row, name) for name in SETTINGS}}
 
 
+def _is_alike(row: Row, first: Row) -> bool:
+    """Whether settings, scales apart, are those that the study names first."""
+    return all(getattr(row, name) == getattr(first, name) for name in SETTINGS)
+
+
 def _sentence(contest: _Contest, where: str, names: Names) -> str:
     """Who is best, who may be as good, who is next."""
     best, others = contest.best, contest.others
@@ -116,8 +127,8 @@ def _sentence(contest: _Contest, where: str, names: Names) -> str:
         parts.append(f"no difference shown: {said} ({_alike(alike)})")
     if behind:
         parts.append(f"{'next, ' * bool(alike)}{_pair(behind[0], names)} {_gap(behind[0])}")
-        runs = {best.run, *(row.run for row in alike), behind[0].run}
-        if another := next((row for row in behind if row.run not in runs), None):
+        trackers = {*map(_tracker, (best, *alike, behind[0]))}
+        if another := next((row for row in behind if _tracker(row) not in trackers), None):
             parts.append(f"the next tracker, {_pair(another, names)}, {_gap(another)}")
     if rival := _best_by_model(contest):
         assumed = (
@@ -128,6 +139,10 @@ def _sentence(contest: _Contest, where: str, names: Names) -> str:
             f"{_by_model(rival):.3f}"
         )
     return "; ".join(parts) + "."
+
+
+def _tracker(row: SummaryRow) -> str:
+    return row.run if row.tracker == "unknown" else row.tracker
 
 
 def _alike(alike: Sequence[SummaryRow]) -> str:
@@ -188,15 +203,20 @@ def _in_words(settings: Sequence[Mapping[str, object]]) -> list[str]:
         if value != settings[0][key] or (key == "scale" and value != 1)
     }
     return [
-        ", ".join(_part(key, value) for key, value in setting.items() if key in differ)
+        _joined({key: value for key, value in setting.items() if key in differ})
         for setting in settings
     ]
 
 
-def _part(key: str, value: object) -> str:
-    if isinstance(value, Fraction):
-        return f"in a world of {value} fps" if key == "fps" else _scale_in_words(value)
-    return f"{'on' if key == 'dataset' else 'with ' + key.replace('_', '-')} {visible(value)}"
+def _joined(setting: Mapping[str, object]) -> str:
+    """Scale, dataset and rate, then the names of what else there is."""
+    named = dict(setting)
+    scale, dataset, fps = (named.pop(key, None) for key in ("scale", "dataset", "fps"))
+    parts = [_scale_in_words(scale)] if isinstance(scale, Fraction) else []
+    parts += [f"on {visible(dataset)}"] if dataset is not None else []
+    parts += [f"in a world of {fps} fps"] if fps is not None else []
+    others = [f"{key.replace('_', '-')} {visible(value)}" for key, value in named.items()]
+    return ", ".join([*parts, *(["with " + ", ".join(others)] if others else [])])
 
 
 def _scale_in_words(scale: Fraction) -> str:
@@ -248,7 +268,9 @@ def _required_in_words(
     for row in required:
         setting = _setting(row, datasets.get(row.run, ""))
         rivals.setdefault((*setting.values(), row.required_auc), []).append(row)
-    groups = list(rivals.values())
+    groups = sorted(
+        rivals.values(), key=lambda rows: not _is_alike(rows[0], required[0])
+    )  # the first setting first
     where = _in_words([_setting(rows[0], datasets.get(rows[0].run, "")) for rows in groups])
     lines = [_slack(*each, names) for each in zip(groups[:MOST_REQUIRED], where)]
     if len(groups) > MOST_REQUIRED:

@@ -43,9 +43,10 @@ def test_replay_writes_figures_tables_and_everything_it_knows(tmp_path: Path) ->
         tables = {"table2", "attributes", "scores", "sequences"}
         assert names(files, "tables", kind) == tables
     printed, kept = json.loads(done.stdout), json.loads(files["replay.json"])
-    assert len(kept["traces"][0]["results"][0].pop("per_sequence")) == 2
     [trace] = kept["traces"]
     assert trace["results"][0]["auc"] == printed["traces"][0]["results"][0]["auc"]
+    sequences = pd.read_parquet(tmp_path / "paper" / "tables" / "sequences.parquet")
+    assert len(sequences) == 2 * len(trace["results"])
     scores = pd.read_parquet(tmp_path / "paper" / "tables" / "scores.parquet")
     assert scores["auc"].tolist() == [result["auc"] for result in trace["results"]]
     assert scores["scale"].dtype == scores["fps"].dtype == "float64"
@@ -103,6 +104,14 @@ def test_compare_over_the_grid_draws_each_sigma(tmp_path: Path) -> None:
     assert b"mAUC & mDP" in files["tables/table2.tex"]
 
 
+def test_hold_alone_recovers_nothing_that_could_be_drawn(tmp_path: Path) -> None:
+    words = ("compare", SLOW, *FEW, "--forecaster", "hold", "--out", tmp_path / "paper")
+    assert run_here(*words).returncode == 0
+    figures = names(files_in(tmp_path / "paper"), "figures", "pdf")
+    assert not [name for name in figures if name.startswith("recovered")]
+    assert "attributes-auc-synthetic-slow-recorded" in figures
+
+
 def test_a_study_writes_figures_and_takes_old_ones_away(tmp_path: Path) -> None:
     study = tmp_path / "study.toml"
     study.write_text(f'traces = ["{SLOW}"]\nsequences = ["boat-calm", "car-chase"]\n')
@@ -130,7 +139,9 @@ def test_what_cannot_be_the_folder_is_told_before_the_work(tmp_path: Path, comma
     (tmp_path / "notes").write_text("mine")
     done = run_here(command, SLOW, "--out", tmp_path / "notes")
     assert done.returncode == 2
-    assert "notes: is there already and is not a folder: name another" in done.stderr
+    assert "notes: name a folder" in done.stderr
     done = run_here(command, SLOW, "--root", tmp_path, "--out", tmp_path)
-    assert "the frames are read from there: name another folder" in done.stderr
+    assert "would replace a file that is read" in done.stderr
+    done = run_here(command, SLOW, "--out", tmp_path / "scores.txt")
+    assert "scores.txt: name a folder" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["notes"]

@@ -48,9 +48,7 @@ def test_identifiers_are_the_figures_own_and_those_that_are_needed(root):
 
 def test_colours_are_variables_that_fall_back_on_themselves(root):
     [use] = [each for each in root.iter() if each.tag.endswith("}use")]
-    assert use.attrib["style"] == (
-        "fill: var(--c0072b2, #0072b2); stroke: var(--cffffff, #ffffff)"
-    )
+    assert use.attrib["style"] == ("fill: var(--c0072b2, #0072b2); stroke: var(--cffffff, #ffffff)")
     assert dark_colours([SVG.decode()]).keys() == {"--c0072b2", "--cffffff"}
 
 
@@ -81,6 +79,8 @@ def test_a_figure_of_matplotlib_keeps_its_text_and_takes_all_its_colours():
     axes.legend()
     text = inlined(svg_of(figure), "a figure", "a-1")
     root = ElementTree.fromstring(text)
-    assert visible(NASTY.replace("$", "")) in [each.text for each in root.iter() if each.tag.endswith("}text")]
+    assert visible(NASTY.replace("$", "")) in [
+        each.text for each in root.iter() if each.tag.endswith("}text")
+    ]
     assert not re.search(r"(?<!, )#[0-9a-f]{6}\b", text)  # none but as a fallback
     assert "<script" not in text

@@ -10,6 +10,7 @@ import subprocess
 from fractions import Fraction
 from html.parser import HTMLParser
 from itertools import pairwise
+
 import pytest
 from nasty import NASTY, nasty_traces
 
@@ -178,7 +179,8 @@ def test_a_study_of_one_trace_and_hold_alone_is_the_same_bytes_twice(tmp_path):
     text = page(View(results))
     ids = [section["id"] for section in Checker(text).of("section")]
     assert ids == [
-        "ranking", "table2", "curves", "front", "sequences", "times", "traces", "conventions", "notes", "study"
+        "ranking", "table2", "curves", "front", "sequences", "times", "traces", "conventions",
+        "notes", "study",
     ]  # fmt: skip
     assert results.notes() == [
         "initialisation at recorded: the trace's times: whether measured, it does not say"

@@ -160,6 +160,15 @@ def test_the_layout_of_the_paper_ranks_what_is_under_latency() -> None:
     assert "sigma 0" in text
 
 
+def test_rows_of_which_nothing_is_known_are_left_out() -> None:
+    rows = [
+        TrackerScores("a", "D", name, {"auc": 0.5, "dp20": 0.6}, {"auc": None, "dp20": None})
+        for name in ("hold", "kalman")
+    ]
+    table = with_and_without(rows, ["hold", "kalman"], TITLES, "")
+    assert [row[1].text for row in table.rows] == ["hold", "kalman"]
+
+
 @pytest.mark.parametrize(("datasets", "columns"), [(1, 4), (2, 6), (3, 5), (4, 6)])
 def test_a_column_holds_few_numbers(datasets: int, columns: int) -> None:
     forms = in_two_forms(with_and_without(scores(datasets), ["hold", "kalman"], TITLES, ""))

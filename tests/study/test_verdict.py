@@ -105,8 +105,8 @@ def test_scales_and_settings_are_said_where_they_tell_apart() -> None:
         "At the times as they are", "At twice the time", "At 1.5 times the time",
     ]  # fmt: skip
     lines = verdict([*setting(CLEAR), *setting(CLEAR, policy="fifo", fps=Fraction(60))])
-    assert lines[0].startswith("With policy latest, in a world of 30 fps, SiamFC with hold is best")
-    assert lines[1].startswith("With policy fifo, in a world of 60 fps, ")
+    assert lines[0].startswith("In a world of 30 fps, with policy latest, SiamFC with hold is best")
+    assert lines[1].startswith("In a world of 60 fps, with policy fifo, ")
     [one] = verdict(setting(CLEAR, scale=Fraction(1, 2)))
     assert one.startswith("At half the time, ")
     lines = verdict([*setting(CLEAR), *setting(CLEAR, dataset="E")])
@@ -153,7 +153,25 @@ def test_one_pair_alone() -> None:
     )
 
 
+def test_traces_of_other_sequences_are_told_apart() -> None:
+    other = {("CSRDCF", "hold"): around(0.6, 30), ("CSRDCF", "kalman"): around(0.5, 30)}
+    lines = verdict([*setting(CLEAR), *setting(other)])
+    assert lines[0].startswith("On 20 sequences, SiamFC with hold is best")
+    assert lines[1].startswith("On 30 sequences, CSRDCF with hold is best")
+
+
+def test_the_next_tracker_is_another_tracker_and_not_another_device() -> None:
+    rows = setting(
+        {("A", "hold"): around(0.6), ("B", "hold"): around(0.5), ("C", "hold"): around(0.4)}
+    )
+    same = [dataclasses.replace(row, tracker="A") if row.tracker == "B" else row for row in rows]
+    assert "B.trace with hold is 0.100 behind" in verdict(same)[0]
+    assert "the next tracker, C.trace with hold, is 0.200 behind" in verdict(same)[0]
+
+
 def test_nothing_scored_says_nothing() -> None:
+    unscored = [dataclasses.replace(r, scores={"auc": None}) for r in setting(CLEAR)]
+    assert verdict(unscored) == []
     assert verdict([]) == []
     assert verdict([dataclasses.replace(r, uncertainty={}) for r in setting(CLEAR)]) == []
 
