@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser, print_json
 from lae_sim.engine.clock import whole
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, install
 from lae_sim.progress import print_text, tell
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 PROGRAM = "lae-sim study"
 
-EXAMPLES = """\
+EXAMPLES = f"""\
 examples:
   lae-sim study study.toml                                everything, on all cores of this machine
   lae-sim study study.toml --out figures --workers 2
@@ -25,7 +25,8 @@ examples:
 
 a study file (TOML); only traces is required, and all worlds, latencies, scales, forecasters and
 conventions are crossed:
-  traces = ["traces/*.parquet"]   files, folders, globs, URLs (s3://...: pip install fsspec s3fs)
+  traces = ["traces/*.parquet"]   files, folders, globs, URLs (s3://...: {install("remote")}
+                                  s3fs)
   timing = ["jetson.parquet"]     other devices' times, for traces of their tracker and dataset
   forecasters = ["hold", "kalman"]       as in compare
   policies = ["latest"]                  as in replay

@@ -1,0 +1,35 @@
+"""What the package says of itself: its extras, spelt in one way wherever they are named."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+from places import REPOSITORY
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+
+
+def test_extras_are_named_in_one_way_in_messages_and_notebooks():
+    named = []
+    for path in [*(REPOSITORY / "lae_sim").rglob("*.py"), *(REPOSITORY / "notebooks").iterdir()]:
+        for command in re.findall(r"pip install [^`\n)]*", source_of(path)):
+            if "[" in command and "{" not in command:  # errors.install makes those with a brace
+                assert re.match(r"pip install 'lae-sim\[\w+\]'", command), (path, command)
+            assert "'.[" not in command, path
+        named += re.findall(r"""lae-sim\[(\w+)\]|\binstall\(["'](\w+)["']\)""", source_of(path))
+    found = {one or other for one, other in named}
+    assert {"torch", "trax", "mat73", "remote", "distributed", "notebook"} <= found <= {*EXTRAS}
+
+
+def source_of(path: Path) -> str:
+    if path.suffix != ".ipynb":
+        return path.read_text("utf-8")
+    cells = json.loads(path.read_text("utf-8"))["cells"]
+    return "\n".join("".join(cell["source"]) for cell in cells)
