@@ -78,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
         help="permitted latencies (default: 0)",
     )
     sigma.add_argument("--sigma-grid", action="store_true", help="sigma = 0, 0.02, ..., 1")
-    add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
+    add("--convention", default="pysot", help="how frames count: as in replay (default: pysot)")
     add("--attributes", action="store_true", help="compare each attribute of the dataset too")
     add("--folds", type=argument(whole), default=5, help="of the training (default: 5)")
     add("--seed", type=argument(whole), default=0, help="of training and bootstrap (default: 0)")

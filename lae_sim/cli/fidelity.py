@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
     add("--closed-loop", **several, required=True, help="real-time traces")
     add("--strided", **several, help="passes on every N-th frame, and gap passes")
     add("--forecaster", nargs="+", default=["hold"], metavar="NAME", help="default: hold")
-    add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
+    add("--convention", default="pysot", help="how frames count: as in replay (default: pysot)")
     add_search(made, pre_forecaster=False)
     add("--per-sequence", action="store_true", help="report each sequence")
     add("--json", action="store_true", help="print one JSON object instead of tables")

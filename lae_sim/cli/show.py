@@ -17,15 +17,15 @@ examples:
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``lae-sim show``; see ``--help``."""
-    parser = new_parser(
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = new_parser(
         "lae-sim show",
-        "Say what a trace holds, and how its processing times are distributed; of a gap pass "
+        "Say what a trace holds, and how its processing times are distributed; of a gap pass\n"
         "(lae-sim profile --gaps), what the tracker's reach is.",
         _EXAMPLES,
     )
-    add = parser.add_argument
+    add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add("--json", action="store_true", help="print one JSON object instead of text")
     add(
@@ -33,7 +33,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar="FILE",
         help="draw the times, or of gap passes the reach (.png, .svg, .pdf)",
     )
-    arguments = parser.parse_args(argv)
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status is 2 for bad input."""
+    arguments = parser().parse_args(argv)
     return exit_status(lambda: _show(arguments), "lae-sim show", arguments.max_decoded)
 
 

@@ -25,8 +25,8 @@ examples:
 
 a study file (TOML); only traces is required, and all worlds, latencies, scales, forecasters and
 conventions are crossed:
-  traces = ["traces/*.parquet"]   files, folders, globs, URLs (s3://...: {install("remote")}
-                                  s3fs)
+  traces = ["traces/*.parquet"]   files, folders, globs, URLs (s3://... needs
+                                  {install("remote")} s3fs)
   timing = ["jetson.parquet"]     other devices' times, for traces of their tracker and dataset
   forecasters = ["hold", "kalman"]       as in compare
   policies = ["latest"]                  as in replay
