@@ -7,6 +7,8 @@ from pathlib import Path
 
 from places import REPOSITORY
 
+from lae_sim.cli import main
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -26,6 +28,12 @@ def test_extras_are_named_in_one_way_in_messages_and_notebooks():
         named += re.findall(r"""lae-sim\[(\w+)\]|\binstall\(["'](\w+)["']\)""", source_of(path))
     found = {one or other for one, other in named}
     assert {"torch", "trax", "mat73", "remote", "distributed", "notebook"} <= found <= {*EXTRAS}
+
+
+def test_the_extras_that_the_version_names_are_those_that_users_may_want():
+    assert {*main.EXTRAS} == {*EXTRAS} - {"test", "dev"}
+    for extra, package in main.EXTRAS.items():
+        assert any(re.match(rf"{package}\b", each) for each in EXTRAS[extra]), extra
 
 
 def source_of(path: Path) -> str:
