@@ -10,6 +10,7 @@ from typing import Any
 
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
+from lae_sim.plugins import looking_in
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
@@ -65,7 +66,7 @@ def run_study(
         if scheduler is not None:
             raise LaeError("workers: for this machine: a scheduler says where to compute instead")
     made, base, kept = _asked_for(study, keys, folder)
-    with ProgressBar("study", "tasks", progress) as bar:
+    with ProgressBar("study", "tasks", progress) as bar, looking_in(base or "."):
 
         def advance(what: str, done: int, total: int) -> None:
             bar(done, total, what)

@@ -1,6 +1,7 @@
 import os
 import re
 import signal
+import sys
 import time
 from fractions import Fraction
 from pathlib import Path
@@ -61,6 +62,7 @@ def double(recording):
 def test_a_policy_of_ones_own(name, tmp_path, monkeypatch):
     (tmp_path / "own_rules.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_rules", raising=False)
     policy = parse_policy(f"own_rules:{name}")
     assert policy(Clock.at(Fraction(1)), [(0, 0, 7)]) == (9, 9_000_000_007)
     assert scores_latency(policy)
@@ -69,6 +71,7 @@ def test_a_policy_of_ones_own(name, tmp_path, monkeypatch):
 def test_a_latency_of_ones_own(tmp_path, monkeypatch):
     (tmp_path / "own_rules.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_rules", raising=False)
     assert times(parse_latency("own_rules:double")) == [180_000_000, 60_000_000, 4]
     assert times(parse_latency("own_rules:double,init=9ns")) == [9, 60_000_000, 4]
     [world] = lae_sim.World.sweep(latency="own_rules:double,init=9ns")

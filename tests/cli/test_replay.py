@@ -345,7 +345,8 @@ def test_a_forecaster_of_ones_own(tmp_path):
     error = replay(SLOW, "--forecaster", "mine:broken", cwd=tmp_path, status=2)
     assert "mine:broken: predicted" in error
     error = replay(SLOW, "--forecaster", "mine:one_argument", cwd=tmp_path, status=2)
-    assert "mine:one_argument: TypeError: " in error
+    assert "one_argument(box) (" in error
+    assert "mine.py, line 11) is called as one_argument(box, image_size): too many" in error
     assert "no-such" in replay(SLOW, "--forecaster", "no-such", status=2)
     assert "ModuleNotFoundError" in replay(
         SLOW, "--forecaster", "no_such:thing", status=2, run=run_process
