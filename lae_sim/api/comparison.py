@@ -26,7 +26,7 @@ from lae_sim.errors import LaeError
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.evaluation.modelled import Ranking
 from lae_sim.files import sequence_names
-from lae_sim.learning.registry import load_any, load_forecaster
+from lae_sim.learning.registry import COMPARED, load_any, load_forecaster
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, label_of, named, open_others
@@ -196,7 +196,7 @@ class ComparisonResult:
 def compare_forecasters(
     traces: Traces,
     *,
-    forecasters: Forecasters = ("kalman", "least-squares", "tuned-kalman"),
+    forecasters: Forecasters = COMPARED,
     sigma: Number | Iterable[Number] = 0,
     latency: str | LatencySource | Sequence[str | LatencySource] = "recorded",
     scale: Number | Sequence[Number] = 1,

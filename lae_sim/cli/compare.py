@@ -21,7 +21,7 @@ from lae_sim.cli.options import (
 )
 from lae_sim.engine.clock import parse_rational, whole
 from lae_sim.errors import LaeError
-from lae_sim.learning.registry import FORECASTERS
+from lae_sim.learning.registry import COMPARED, FORECASTERS
 from lae_sim.progress import print_text
 
 if TYPE_CHECKING:
@@ -57,9 +57,9 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--forecaster",
         nargs="+",
-        default=["kalman", "least-squares", "tuned-kalman"],
+        default=[*COMPARED],
         metavar="NAME",
-        help="see below (default: kalman least-squares tuned-kalman); hold is always compared",
+        help=f"see below (default: {' '.join(COMPARED)}); hold is always compared",
     )
     add("--sequence", nargs="+", metavar="NAME", help="these sequences only")
     add_passes(add)

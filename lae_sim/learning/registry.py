@@ -46,6 +46,7 @@ BUILT_IN = (
     "learned",
     "oracle",
 )
+COMPARED = ("learned", "kalman", "least-squares", "tuned-kalman")  # unless others are named
 
 
 def load_forecaster(name: str, camera: Camera | None = None) -> AnyFactory:

@@ -64,15 +64,15 @@ def test_the_table_of_the_default(tmp_path: Path) -> None:
     lines = printed.splitlines()
     assert lines[0] == "trace synthetic-slow.parquet, sigma 0"
     assert lines[2].split()[:6] == ["latency", "forecaster", "n", "AUC", "recovered", "vs"]
-    names = ["hold", "kalman", "least-squares", "tuned-kalman", "offline"]
-    rows = [line.split()[:3] for line in lines[4:14]]
+    names = ["hold", "learned", "kalman", "least-squares", "tuned-kalman", "offline"]
+    rows = [line.split()[:3] for line in lines[4:16]]
     assert rows == [[latency, n, "3"] for latency in ("recorded", "constant:20ms") for n in names]
     assert "tuned-kalman: trained in 3 folds over 3 sequences" in printed
     assert "bootstrap over sequences" in printed
     assert "synthetic-slow.parquet, recorded: approximate" in printed
     assert "convention pysot, policy latest" in printed
     table = pd.read_parquet(path)
-    for latency, line in (("recorded", lines[5]), ("constant:20ms", lines[10])):
+    for latency, line in (("recorded", lines[6]), ("constant:20ms", lines[12])):
         chosen = table[(table["latency"] == latency) & (table["metric"] == "auc")]
         mean = chosen.loc[chosen["forecaster"] == "kalman", "value"].mean()
         assert line.split()[3] == f"{mean:.3f}"
