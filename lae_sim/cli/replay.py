@@ -261,7 +261,13 @@ def _print_tables(
     swept: Sequence[str],
     arguments: argparse.Namespace,
 ) -> None:
-    from lae_sim.report.replay import attribute_table, sequence_table, settings_text, summary_table
+    from lae_sim.report.replay import (
+        attribute_table,
+        closing_text,
+        sequence_table,
+        settings_text,
+        summary_table,
+    )
 
     shown = sorted({float(sigma) for sigma in arguments.sigma})
     for each in reports:
@@ -272,8 +278,5 @@ def _print_tables(
     print_text(summary_table(reports, trace_labels, shown, swept), end="\n\n")
     for each in reports:
         print_text(settings_text(each))
-    if "fps" in swept:
-        print_text(
-            "a sweep of the rate is one of how fast the world moves: recorded frames arrive "
-            "faster, with the same motion from one to the next"
-        )
+    if closing := closing_text(reports, trace_labels, swept):
+        print_text(closing)

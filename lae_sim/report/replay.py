@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim.engine.clock import Clock
-from lae_sim.evaluation.caveats import left_search, search_notes
+from lae_sim.evaluation.caveats import at_the_floor, floor_notes, left_search, search_notes
 from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED
@@ -336,6 +336,22 @@ def _interval_of(line: Line) -> str | None:
 
 def _change(metric: str, line: Line) -> float | None:
     return relative_change(line[metric], line.get(f"offline_{metric}"))
+
+
+def closing_text(reports: Sequence[Report], labels: Sequence[str], swept: Sequence[str]) -> str:
+    """What there is to say of all traces together, in lines; empty if nothing."""
+    notes = floor_notes(
+        label
+        for label, report in zip(labels, reports)
+        for result in report["results"]
+        if result["sigma"] == 0 and at_the_floor(report["skip_rate"], result["mismatch_mean"])
+    )
+    if "fps" in swept:
+        notes.append(
+            "a sweep of the rate is one of how fast the world moves: recorded frames arrive "
+            "faster, with the same motion from one to the next"
+        )
+    return "\n".join(fill(note, 100, break_on_hyphens=False) for note in notes)
 
 
 def settings_text(report: Report) -> str:

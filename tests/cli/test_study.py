@@ -531,6 +531,8 @@ def test_what_the_means_rest_on_is_said(tmp_path: Path) -> None:
     assert "synthetic: its traces do not have the same sequences: compare no means" in notes
     assert "few: times: synthetic (made up, not measured)" in notes
     assert "answers come later by what forecasting costs: kalman 2000 us" in notes
+    floor = "a floor of one frame for synthetic-fast, though almost no frame is skipped: "
+    assert [note.startswith(floor) for note in notes if "floor" in note] == [True]
 
 
 # ------------------------------------------------------------------------------ resuming
