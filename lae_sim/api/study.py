@@ -11,7 +11,7 @@ from typing import Any
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
 from lae_sim.plugins import looking_in
-from lae_sim.progress import ProgressBar
+from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
 from lae_sim.report.study_tables import write_tables
@@ -27,7 +27,7 @@ def run_study(
     workers: int | None = None,
     scheduler: str | None = None,
     report: bool = True,
-    progress: bool | None = None,
+    progress: ShowProgress = None,
     **keys: Any,
 ) -> StudyResults:
     """Replay and score many traces in many worlds, or go on where an earlier run stopped.
@@ -40,7 +40,8 @@ def run_study(
         workers: processes on this machine; by default one for each core. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead.
         report: whether to write ``report.html`` and ``tables/`` too.
-        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        progress: whether to show a progress bar, by default on a terminal and in a notebook; or a
+            function, which is told: ``progress(done, total, what)``.
         keys: keys of the study file (see :class:`Study`).
 
     In a script, call it under ``if __name__ == "__main__":``, since workers import the script.
