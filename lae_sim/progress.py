@@ -6,6 +6,7 @@ what stands on the screen, or fail for want of a letter.
 
 from __future__ import annotations
 
+import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -48,6 +49,13 @@ def print_text(text: str, end: str = "\n") -> None:
     shown = visible(text, keep="\n").encode(encoding, "replace").decode(encoding)
     with printing():
         print(shown, end=end)
+
+
+def screen_width() -> int | None:
+    """How many letters a line of the terminal holds that shows the standard output; else None."""
+    if sys.stdout is None or not sys.stdout.isatty():
+        return None
+    return shutil.get_terminal_size().columns
 
 
 @contextmanager

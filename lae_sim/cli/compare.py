@@ -22,7 +22,7 @@ from lae_sim.cli.options import (
 from lae_sim.engine.clock import parse_rational, whole
 from lae_sim.errors import LaeError
 from lae_sim.learning.registry import COMPARED, FORECASTERS
-from lae_sim.progress import print_text
+from lae_sim.progress import print_text, screen_width
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -157,7 +157,7 @@ def _compare(arguments: argparse.Namespace) -> None:
         print_json(document)
         return
     for table in reversed(tables.values()):
-        print_text(comparison_table(table), end="\n\n")
+        print_text(comparison_table(table, screen_width()), end="\n\n")
     about = f"convention {arguments.convention}, policy {arguments.policy}"
     print_text("\n".join([about, *result.notes]))
 

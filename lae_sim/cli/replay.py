@@ -24,7 +24,7 @@ from lae_sim.engine.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import labels
 from lae_sim.learning.registry import FORECASTERS
-from lae_sim.progress import print_text
+from lae_sim.progress import print_text, screen_width
 
 if TYPE_CHECKING:
     from lae_sim.api.evaluation import Scenario
@@ -269,13 +269,13 @@ def _print_tables(
         summary_table,
     )
 
-    shown = sorted({float(sigma) for sigma in arguments.sigma})
+    shown, width = sorted({float(sigma) for sigma in arguments.sigma}), screen_width()
     for each in reports:
         if arguments.per_sequence:
-            print_text(f"{each['trace']}\n\n{sequence_table(each, shown, swept)}\n")
+            print_text(f"{each['trace']}\n\n{sequence_table(each, shown, swept, width)}\n")
         if arguments.attributes:
-            print_text(f"{each['trace']}\n\n{attribute_table(each, shown, swept)}\n")
-    print_text(summary_table(reports, trace_labels, shown, swept), end="\n\n")
+            print_text(f"{each['trace']}\n\n{attribute_table(each, shown, swept, width)}\n")
+    print_text(summary_table(reports, trace_labels, shown, swept, width), end="\n\n")
     for each in reports:
         print_text(settings_text(each))
     if closing := closing_text(reports, trace_labels, swept):
