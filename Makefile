@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench samples clean
+.PHONY: demo test lint bench samples dist clean
 
 demo: $(VENV)/.demo  ## replay the sample traces
 	$(BIN)/lae-sim replay traces/synthetic-slow.parquet traces/synthetic-fast.parquet
@@ -25,6 +25,11 @@ bench: $(VENV)/.test  ## measure speed and memory
 samples: $(VENV)/.demo  ## make the sample traces anew
 	$(BIN)/python traces/make_samples.py
 	$(BIN)/python traces/make_cases.py
+
+dist: $(VENV)/.dev  ## build wheel and sdist in dist/, and check them as the index would
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/twine check --strict dist/*
 
 clean:
 	rm -rf $(VENV)

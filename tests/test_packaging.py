@@ -5,6 +5,8 @@ import re
 import sys
 from pathlib import Path
 
+import pytest
+from distributions import oldest
 from places import REPOSITORY
 
 from lae_sim.cli import main
@@ -31,9 +33,25 @@ def test_extras_are_named_in_one_way_in_messages_and_notebooks():
 
 
 def test_the_extras_that_the_version_names_are_those_that_users_may_want():
-    assert {*main.EXTRAS} == {*EXTRAS} - {"test", "dev"}
+    assert {*main.EXTRAS} == {*EXTRAS} - {"dev", "docs", "test"}
     for extra, package in main.EXTRAS.items():
         assert any(re.match(rf"{package}\b", each) for each in EXTRAS[extra]), extra
+
+
+def test_every_dependency_has_a_lower_bound_that_the_oldest_installation_takes():
+    bounds = oldest()
+    for each in (*PROJECT["dependencies"], *EXTRAS["remote"], *EXTRAS["mat73"], *EXTRAS["trax"]):
+        name = re.split(r"[ ;]", each)[0]
+        assert re.match(rf"{name} >= {re.escape(bounds[name])}(;|$)", each), each
+
+
+def test_the_citation_names_the_package_and_the_paper():
+    yaml = pytest.importorskip("yaml", reason="it comes with the extra distributed")
+    cited = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text("utf-8"))
+    assert (cited["cff-version"], cited["license"]) == ("1.2.0", PROJECT["license"])
+    [author] = cited["authors"]
+    assert author["name"] in (REPOSITORY / "LICENSE").read_text("utf-8")
+    assert "arXiv:2103.04508" in str(cited["references"])
 
 
 def source_of(path: Path) -> str:
