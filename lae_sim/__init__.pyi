@@ -14,6 +14,8 @@ from .forecast.kalman import Kalman
 from .importers.convert import convert_results
 from .learning.registry import load_forecaster
 from .profile.run import profile_tracker
+from .recipes.catalogue import list_recipes
+from .recipes.make import get_trace
 from .replay.run import Run, Runs, replay_sequence
 from .replay.world import SIGMA_GRID, World, replay_trace
 from .report.film import Scene
@@ -52,6 +54,8 @@ __all__ = [
     "evaluate_runs",
     "event_log",
     "find_dataset",
+    "get_trace",
+    "list_recipes",
     "load_forecaster",
     "max_decoded",
     "profile_tracker",

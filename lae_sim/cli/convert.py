@@ -151,11 +151,12 @@ def _convert(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json(summary.document(arguments.out))
     else:
-        print_text(_text(summary, arguments.out))
+        next_step = f"Next: lae-sim replay {arguments.out}"
+        print_text("\n".join([*lines_of(summary, arguments.out), next_step]))
 
 
-def _text(summary: ConversionSummary, out: Path) -> str:
-    """The summary for people."""
+def lines_of(summary: ConversionSummary, out: Path) -> list[str]:
+    """The summary of the conversion to a trace, for people."""
     from lae_sim.datasets.dropped import note
 
     processed = "every frame"
@@ -193,7 +194,7 @@ def _text(summary: ConversionSummary, out: Path) -> str:
         lines.append(f"Left out, without ground truth: {listed(summary.without_truth)}.")
     if summary.without_results:
         lines.append(f"Without results: {listed(summary.without_results)}.")
-    return "\n".join([*lines, f"Next: lae-sim replay {out}"])
+    return lines
 
 
 def _milliseconds(ms: float) -> str:

@@ -17,6 +17,7 @@ COMMANDS = {
     "compare": "compare forecasters, with intervals and paired tests",
     "convert": "make a trace from results that a tracker left (boxes and times)",
     "fidelity": "measure how far replays of a tracker are from its closed loop",
+    "get": "make a trace of public results by name, or list those there are",
     "profile": "run a tracker on this device and leave a trace",
     "render": "draw a replay over its frames, as a film or a contact sheet",
     "replay": "replay traces and score them, latency counted",

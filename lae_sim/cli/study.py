@@ -50,7 +50,7 @@ conventions are crossed:
   sequences = ["car1"]                   these only
   attributes = true                      in the report
   folds = 5                              of the training of forecasters that must be trained
-  require_auc = 0.5                      look for the slowest device on which each tracker has it
+  require_auc = 0.5                      how slow each tracker may be to have it; or a list of AUCs
 modules of your own, as in forecasters = ["mine:Damped:a=0.3"], are first looked for beside the file
 """
 

@@ -144,6 +144,36 @@ class Lanes:
         first: Ints = self.offsets[self.lane(item)]
         return first
 
+    def firsts(self) -> Ints:
+        """The first item of every item's lane, int64 [N]."""
+        return np.repeat(self.offsets[:-1], np.diff(self.offsets))
+
+    def in_step(self) -> tuple[Ints, Ints]:
+        """The items in time-major order: the k-th of every lane that has one, for each k.
+
+        What goes through all lanes in step works on one stretch of memory at each step: lanes are
+        sorted by length, so those that go on are the first ones of the step before. Three lanes of
+        4, 3 and 1 items:
+
+            lane       in time-major order
+            a0 a1 a2 a3     a0 b0 c0 | a1 b1 | a2 b2 | a3
+            b0 b1 b2        running = 3, 2, 2, 1
+            c0
+
+        Returns:
+            The item at each place of that order, int64 [N], and how many lanes have more than k
+            items, int64 [items of the longest].
+        """
+        lengths = np.diff(self.offsets)
+        longest = np.argsort(-lengths, kind="stable")
+        steps = np.arange(lengths.max(initial=0))
+        running: Ints = np.searchsorted(-lengths[longest], -steps)
+        begins = np.cumsum(running) - running
+        lane = np.arange(len(self.frames)) - np.repeat(begins, running)
+        order: Ints = self.offsets[longest].take(lane)
+        order += np.repeat(steps, running)
+        return order, running
+
     def image_sizes_at(self, item: Ints, frame: Ints | Floats) -> Floats:
         """Width and height of frames' images in the lanes of some items, float64 [P, 2].
 
@@ -395,9 +425,9 @@ def forecast(
             boxes = np.asarray(factory.forecast_lanes(lanes, item, frame), np.float64)
             if boxes.shape != (len(item), 4):
                 raise LaeError(f"{name}: answered {boxes.shape}, not {(len(item), 4)}")
-            good = np.isfinite(boxes).all(axis=1)
-            if not good.all():
-                box, at = boxes[~good][0], frame[~good][0]
+            if not np.isfinite(boxes).all():
+                bad = int(np.argmin(np.isfinite(boxes).all(axis=1)))
+                box, at = boxes[bad], frame[bad]
                 raise LaeError(f"{name}: predicted {box} for frame {at}, not a box x, y, w, h")
             return boxes
         return _streamed(factory, lanes, item, frame, name, number)

@@ -189,7 +189,7 @@ class _Batch:
         offset = goals[..., :2] + goals[..., 2:] / 2 - centre[:, None]
         parts = np.concatenate([offset, goals[..., 2:], sides], axis=2)
         return cls(
-            past.velocity[window],
+            past.velocity.T[window],
             past.interval[window],
             np.stack(shape, axis=1),
             (parts / place.size[:, None, None]).astype(np.float32),
@@ -207,8 +207,8 @@ class _Batch:
 
     def change(self, torch: Any, network: Any, ahead: Floats) -> Any:
         """What the network says of each: change of centre and sides, [P, 4]."""
-        mirror = mirrored(self.motion[:, :VELOCITIES])
-        rows = rows_of(self.motion, self.interval)
+        mirror = mirrored(self.motion[:, :VELOCITIES].transpose(1, 2, 0)).T
+        rows = np.moveaxis(rows_of(np.moveaxis(self.motion, -1, 0), self.interval), 0, -1)
         rows[..., :2] *= mirror[:, None]
         inputs = np.concatenate([rows.reshape(len(rows), -1), self.shape], axis=1) / ONE
         near, mirror, motion, inputs = (

@@ -47,7 +47,7 @@ def trace_report(
     per_sequence: SequenceRows | None = None,
     attributes: bool = True,
 ) -> Report:
-    """The figures of one trace as a JSON object (documented in the README).
+    """The figures of one trace as a JSON object (described in docs/reference/json.md).
 
     Args:
         totals: scores, whose forecasters and sigmas are the ones named.

@@ -31,6 +31,7 @@ from lae_sim.report.study_view import (
 )
 from lae_sim.report.table import (
     CHANGE,
+    FINE_SCORE,
     PERCENT,
     SCORE,
     SIGNED,
@@ -38,6 +39,7 @@ from lae_sim.report.table import (
     Column,
     Number,
     Table,
+    filled,
     latex_of,
     legend_of,
     p_label,
@@ -46,6 +48,7 @@ from lae_sim.report.table import (
     write_csv,
 )
 from lae_sim.study.records import Comparison, Requirement, SummaryRow
+from lae_sim.study.verdict import device_in_words, shortfalls, significant
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
@@ -95,6 +98,9 @@ _RANKING = (
     Column("vs hold", "vs_hold_auc", SIGNED, "AUC won over hold"),
     Column("p", "vs_hold_auc_p", p_label, "of no difference to hold: Wilcoxon's signed-rank test "
            "over sequences, not corrected"),
+    Column("vs best", "vs_best_auc", SIGNED, "AUC to the best of the same setting and sequences"),
+    Column("p (best)", "vs_best_auc_p_holm", p_label, "of no difference to the best: the same "
+           "test, corrected by Holm's method for the number of those compared with it"),
     Column("DP", "dp20", SCORE, "precision at 20 px"),
     Column("modelled DP", "modelled_dp20", SCORE, "under the search model"),
     Column("lost", "lost_share", PERCENT, "share of the outputs answered while the target is lost"),
@@ -117,7 +123,8 @@ _RANKING = (
 )  # fmt: skip
 _PAPER = ("AUC", "modelled", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")
 _TERMINAL = ("n", "AUC", "modelled", "ranked by", "jitter", "offline", "recovered", "vs hold", "p",
-             "DP", "ms/call", "init ms", "skipped", "age ms", "front")  # fmt: skip
+             "vs best", "p (best)", "DP", "ms/call", "init ms", "skipped", "age ms",
+             "front")  # fmt: skip
 _INTERVALS = ("AUC", "mAUC", "modelled", "jitter", "AUC of a - b", "mAUC of a - b")
 
 
@@ -316,40 +323,53 @@ def comparison_table(view: View) -> Table:
     return replace(table, note=note)
 
 
-def required_table(view: View, mark_ends: bool = False) -> Table:
-    """A row per trace, setting and forecaster: how slow it may be.
-
-    ``mark_ends`` tells scales at which the search ended, short of the true one, by ``>=``.
-    """
+def required_table(view: View) -> Table:
+    """A row per trace, setting, forecaster and AUC asked: how slow the tracker may be."""
     rows = view.results.required
     columns = [
-        *_names(["trace", *_differing(rows, [key for key in SETTINGS if key != "scale"])]),
+        *_names(["tracker", *_differing(rows, [key for key in SETTINGS if key != "scale"])]),
         *_names(["forecaster"]),
         Column("AUC asked", "required_auc", Number(".3g")),
-        Column("without latency", "auc_without_latency", SCORE),
-        Column("times at most x", partial(_most, mark_ends),
-               meaning="by bisection, in steps of 0.01"),
-        Column("AUC there", "auc", SCORE),
-        Column("speed-up needed", "speed_up", _RATIO),
-        Column("world fps at most", "fps_at_most", _MS,
-               "unknown where a cost or a policy has a time of its own"),
+        Column("ms per frame", "safe_ms_per_frame", significant,
+               "the slowest mean time of a call, the initialisations apart"),
+        Column("fps", "safe_frames_per_second", significant,
+               "frames that a tracker of this time processes per second"),
+        Column("device", "device", meaning="against the times that are replayed"),
+        Column("AUC there", "safe_auc", FINE_SCORE),
+        Column("then", "next_auc", FINE_SCORE, "AUC with all times a hundredth longer"),
+        Column("offline", "auc_without_latency", SCORE, "AUC without latency"),
+        Column("or world fps", "world", _MS, "how fast the world may move instead, with the "
+               "recorded motion from frame to frame; unknown where a cost or a policy has a time "
+               "of its own"),
     ]  # fmt: skip
     if any(row.ranked_by == "modelled" for row in rows):
         columns.append(Column("AUC is", "ranked_by", meaning="as the ranking has it"))
     return Table.of(
         columns,
-        [{**row.flat(), "trace": run_of(row)} for row in rows],
+        [
+            {
+                **row.flat(),
+                "tracker": view.names.get(row.run, row.run),
+                "device": _device(row),
+                "world": _world(row),
+            }
+            for row in rows
+        ],
         "required",
-        "How slow a device may be, and how fast the world may move (with the recorded motion from "
-        f"frame to frame), for the required AUC at sigma {rows[0].sigma}",
+        f"How slow a tracker may be for the required AUC at sigma {rows[0].sigma}",
     )
 
 
-def _most(mark_ends: bool, row: Row) -> Cell | None:
-    if row["scale"] is None:
+def _device(row: Requirement) -> Cell:
+    """What is asked of the device, in words; its value is the scale of all times."""
+    return Cell(device_in_words(row), None if row.safe_scale is None else float(row.safe_scale))
+
+
+def _world(row: Requirement) -> float | None:
+    """The rate of the world for which a tracker may be as slow as it is."""
+    if not row.safe_scale or row.fps_at_most is None:
         return None
-    scale = float(Fraction(row["scale"]))
-    return Cell(">= " * (mark_ends and not row["beyond"]) + f"{scale:.2f}", scale)
+    return float(row.safe_scale * row.fps)
 
 
 def _differing(rows: Sequence[Comparison | Requirement], keys: Iterable[str]) -> list[str]:
@@ -409,12 +429,13 @@ def study_text(results: StudyResults | View) -> str:
     if results.comparisons and (repeated or len(results.comparisons) <= 30):
         tables.append(comparison_table(view))
     if results.required:
-        tables.append(required_table(view, mark_ends=True))
-    parts = []
+        tables.append(required_table(view))
+    parts = ["\n".join(filled(line) for line in results.verdict())]
     for table in tables:
         text = text_of(table, intervals=_INTERVALS)
         text = text.replace("★", "*")  # not every terminal has stars
         parts.append("\n".join([table.caption, text, legend_of(table)]))
+    parts += ["\n".join(map(filled, shortfalls(results.required, view.names)))]
     lines = [f"{len(results.plan.cells)} cells, {results.computed} of them computed now"]
     approximate = [row.approximate_share for row in view.rows if not row.exact]
     if approximate:
@@ -423,4 +444,4 @@ def study_text(results: StudyResults | View) -> str:
             "another frame than when recorded"
         )
     lines += [f"not computed: {each.of}: {each.reason}" for each in results.failures]
-    return "\n\n".join([*parts, "\n".join([*lines, *results.notes()])])
+    return "\n\n".join([*filter(None, parts), "\n".join([*lines, *results.notes()])])

@@ -280,8 +280,12 @@ def _shortened(names: list[str], most: int) -> list[str]:
 def legend_of(table: Table) -> str:
     """What the columns mean, in lines that fit a terminal."""
     parts = [f"{column.title}: {column.meaning}" for column in table.columns if column.meaning]
-    text = "; ".join(parts + [table.note] * bool(table.note))
-    return textwrap.fill(text, 100, break_on_hyphens=False)
+    return filled("; ".join(parts + [table.note] * bool(table.note)))
+
+
+def filled(text: str) -> str:
+    """A text in lines that fit a terminal."""
+    return textwrap.fill(text, 100, break_on_hyphens=False, break_long_words=False)
 
 
 def aligned(header: Sequence[str], lines: Sequence[Sequence[str]], labels: int = 2) -> str:

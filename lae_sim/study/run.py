@@ -19,7 +19,7 @@ from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
 from lae_sim.study.cells import Task
-from lae_sim.study.deployment import Slowest, requirement, searches
+from lae_sim.study.deployment import Curve, requirement, searches
 from lae_sim.study.executors import cores, run_all
 from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import Comparison, Failure, Record, Requirement, SummaryRow
@@ -32,6 +32,7 @@ from lae_sim.study.summary import (
     read_scores,
     summarise_study,
 )
+from lae_sim.study.verdict import verdict
 from lae_sim.study.work import Description, Work, attempt
 from lae_sim.trace.describe import is_measured
 
@@ -70,6 +71,8 @@ class StudyResults:
           forecaster    auc  vs_hold_auc
         0       hold  0.572          NaN
         1     kalman  0.629        0.057
+        >>> print(*results.verdict())
+        slow-and-accurate with kalman is best: AUC 0.629 [0.573, 0.687]; no difference shown: ...
     """
 
     folder: Path
@@ -172,6 +175,10 @@ class StudyResults:
             notes += [f"{trace['trace']}: {text}" for text in trace["warnings"]]
         return list(dict.fromkeys(notes))
 
+    def verdict(self) -> list[str]:
+        """What it comes to, in words (see :func:`lae_sim.study.verdict.verdict`)."""
+        return verdict(self.summary, self.required)
+
     def document(self) -> dict[str, Any]:
         """All but the scores of single sequences, as ``study.json`` holds it."""
         return {
@@ -179,6 +186,7 @@ class StudyResults:
             "version": "1.0",
             "lae_sim": __version__,
             "study": self.plan.study.document(),
+            "verdict": self.verdict(),
             "cells": len(self.plan.cells),
             "failures": flat_rows(self.failures),
             "notes": self.notes(),
@@ -246,7 +254,7 @@ def _run(
 ) -> StudyResults:
     study = plan.study
     store.prepare(plan.cells)
-    asked = [] if study.require_auc is None else searches(plan.cells, study.require_auc)
+    asked = searches(plan.cells, study.require_auc) if study.require_auc else []
     described = [Description(source.input, study.sequences) for source in plan.sources]
     cells = [cell for cell in plan.cells if not store.has(cell)]
     sought = [search for search in asked if store.document(search.key) is None]
@@ -286,7 +294,10 @@ def _run(
         summary=tuple(summarise_study(scores, study.seed)),
         comparisons=tuple(compare_traces(scores, study.seed)),
         required=tuple(
-            requirement(search, Slowest(**answer)) for search, answer in answers if answer
+            requirement(search, Curve(**answer), auc)
+            for search, answer in answers
+            if answer
+            for auc in search.required
         ),
         traces=tuple(filter(None, (store.document(each.key) for each in described))),
         computed=computed,

@@ -221,6 +221,7 @@ BASE = {
     "compare": ("plain.parquet", "--forecaster", "hold"),
     "convert": CONVERT,
     "fidelity": ("plain.parquet", "--closed-loop", "plain.parquet"),
+    "get": ("dtb70/kcf", "--mirror", "none-such"),
     # what is no error would run the tracker
     "profile": ("--in-process", "--out", "none/o.parquet", "--sequence", "none-such"),
     "render": ("plain.parquet", "--out", "o.png"),

@@ -384,12 +384,15 @@ def test_the_tables_and_the_page_say_by_what_they_rank(tmp_path: Path) -> None:
     keys = {"latencies": [FAR["latencies"][0]], "search": ["c=0.3", "off"]}
     alone = ("--workers", 1)
     printed = study_here(toml(tmp_path, **keys), *alone, cwd=tmp_path)
-    assert "ranked by" in printed.splitlines()[1]
-    assert "modelled scores, and recorded" in printed.splitlines()[0]
+    caption, header, *_ = printed.partition("\n\n")[2].splitlines()  # after the verdict
+    assert "ranked by" in header
+    assert "modelled scores, and recorded" in caption
     assert "not computed" not in printed
     assert "the reach is given or measured" in " ".join(printed.split())
     one = study_here(toml(tmp_path, **{**keys, "search": "c=0.3"}), *alone, cwd=tmp_path)
-    assert one.splitlines()[0].endswith("sigma 0, modelled scores")
+    assert "best: modelled AUC" in one.partition("\n\n")[0]
+    caption = one.partition("\n\n")[2].splitlines()[0]
+    assert caption.endswith("sigma 0, modelled scores")
     assert "Trackers against each other, by the modelled AUC" in one
     page = (tmp_path / "study-results" / "report.html").read_text()
     assert "synthetic-slow: modelled: c = 0.3, as given" in page
