@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from lae_sim.cli.options import argument, exit_status, new_parser, print_json
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, install
-from lae_sim.progress import print_text, tell
+from lae_sim.progress import print_text, screen_width, tell
 
 if TYPE_CHECKING:
     from lae_sim.study.records import Failure
@@ -103,6 +103,6 @@ def _study(arguments: argparse.Namespace, failed: list[Failure]) -> None:
     else:
         from lae_sim.report.study_tables import study_text
 
-        print_text(study_text(results), end="\n\n")
+        print_text(study_text(results, screen_width()), end="\n\n")
         left = sorted(path.name for path in results.folder.glob("[!.]*"))
         print_text(f"{results.folder}: {', '.join(left)}")

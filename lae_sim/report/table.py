@@ -213,7 +213,7 @@ def text_of_records(
     return _fitted(columns, lines, width)
 
 
-_LONG, _SHORT = 24, 8
+_LONG, _SHORT = 24, 12
 """Letters to which names are shortened for the sake of any column, and of the most important."""
 _MOST_IMPORTANT = 8
 
@@ -249,10 +249,13 @@ def _fitted(columns: Sequence[Column], lines: Iterable[Sequence[str]], width: in
     shorten(range(len(columns)), _LONG)
     shown = {*range(labels)}
     for c in sorted(range(labels, len(columns)), key=lambda c: (-columns[c].importance, c)):
+        before = [*texts]
         if columns[c].importance >= _MOST_IMPORTANT:
             shorten({*shown, c}, _SHORT)
         if excess({*shown, c}) <= 0 or len(shown) == labels:
             shown.add(c)
+        else:
+            texts = before
     text = aligned(*_lines_of([texts[c] for c in sorted(shown)]), labels)
     missing = [each.name or each.title for c, each in enumerate(columns) if c not in shown]
     if not missing:
