@@ -113,7 +113,7 @@ def kinds(cell: Any) -> list[Any]:
 
 def main(*names: str) -> None:
     """Run all notebooks, or those named, and store what they print."""
-    os.environ |= {"TQDM_DISABLE": "1"}
+    os.environ |= {"TQDM_DISABLE": "1", "PYTHONPATH": str(REPOSITORY)}
     os.environ.pop("LAE_SIM_DATA", None)
     for path in NOTEBOOKS:
         if not names or path.stem in names:
