@@ -2,7 +2,8 @@
 
 Execution counts and times of the run are left out, and pictures are small, so that a run that
 finds the same leaves the file as it is. Notebooks that measure the machine at hand, ``MEASURED``,
-keep what is stored as long as a run prints and draws as much.
+and cells that do so, by their tag ``measured``, keep what is stored as long as a run prints and
+draws as much.
 """
 
 from __future__ import annotations
@@ -85,20 +86,23 @@ def _smaller(png: str) -> str:
     return base64.b64encode(file.getvalue()).decode()
 
 
-def merged(stored: Any, fresh: Any, measured: bool) -> Any:
+def merged(path: Path, fresh: Any) -> Any:
     """The fresh notebook, with those outputs that are stored and no news.
 
-    Args:
-        stored: what is in the file.
-        fresh: what a run of it left.
-        measured: whether all that prints and draws as much is none; else pictures alone, whose
-            pixels depend on the version of Matplotlib.
+    Pictures are none, whose pixels depend on the version of Matplotlib.
     """
+    stored = nbformat.read(path, as_version=4)
     for old, new in zip(code_cells(stored), code_cells(fresh)):
         if kinds(old) == kinds(new):
             for before, after in zip(old.outputs, new.outputs):
-                after.update(before if measured or said(before) == said(after) else {})
+                if is_measured(path, new) or said(before) == said(after):
+                    after.update(before)
     return fresh
+
+
+def is_measured(path: Path, cell: Any) -> bool:
+    """Whether what a cell says is of the machine at hand."""
+    return path.stem in MEASURED or "measured" in cell.metadata.get("tags", ())
 
 
 def said(output: Any) -> str:
@@ -117,8 +121,7 @@ def main(*names: str) -> None:
     os.environ.pop("LAE_SIM_DATA", None)
     for path in NOTEBOOKS:
         if not names or path.stem in names:
-            stored = nbformat.read(path, as_version=4)
-            nbformat.write(merged(stored, executed(path), path.stem in MEASURED), path)
+            nbformat.write(merged(path, executed(path)), path)
             print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB", flush=True)
 
 
