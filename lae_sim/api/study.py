@@ -11,7 +11,8 @@ from typing import Any
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
 from lae_sim.figures.study import study_in_columns
-from lae_sim.progress import ProgressBar
+from lae_sim.plugins import looking_in
+from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
 from lae_sim.report.paper import Paper, remove_paper, write_paper
@@ -29,7 +30,7 @@ def run_study(
     scheduler: str | None = None,
     report: bool = True,
     root: str | os.PathLike[str] | None = None,
-    progress: bool | None = None,
+    progress: ShowProgress = None,
     **keys: Any,
 ) -> StudyResults:
     """Replay and score many traces in many worlds, or go on where an earlier run stopped.
@@ -44,7 +45,8 @@ def run_study(
         report: whether to write ``report.html``, ``figures/`` and ``tables/`` too.
         root: folder of the dataset, for the report to show a few sequences with their images;
             synthetic ones need none.
-        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        progress: whether to show a progress bar, by default on a terminal and in a notebook; or a
+            function, which is told: ``progress(done, total, what)``.
         keys: keys of the study file (see :class:`Study`).
 
     In a script, call it under ``if __name__ == "__main__":``, since workers import the script.
@@ -74,13 +76,14 @@ def run_study(
     if root is not None and not Path(root).expanduser().exists():
         raise LaeError(f"root: there is no {root}")
     made, base, kept = _asked_for(study, keys, folder)
-    with ProgressBar("study", "tasks", progress) as bar:
+    with looking_in(base or "."):
+        with ProgressBar("study", "tasks", progress) as bar:
 
-        def advance(what: str, done: int, total: int) -> None:
-            bar(done, total, what)
+            def advance(what: str, done: int, total: int) -> None:
+                bar(done, total, what)
 
-        results = compute_study(made, kept, base, workers, scheduler, advance)
-    write_views(results, report, root)
+            results = compute_study(made, kept, base, workers, scheduler, advance)
+        write_views(results, report, root)
     return results
 
 

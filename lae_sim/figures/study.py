@@ -302,17 +302,18 @@ def _name_trackers(axes: Axes, view: View, points: Sequence[Point]) -> None:
     # the worst first
     best = {run_of(point.row): point for point in sorted(points, key=lambda point: point.auc)}
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    inches = axes.get_position().width * axes.get_figure().get_figwidth()
+    inches = axes.bbox.width / axes.figure.dpi
     letter, line = 0.055 * (right - left) / inches, 0.055 * (high - low)
     taken: list[tuple[float, float, float]] = []
     for run, point in best.items():
         name, x, y = _short(view.names[run]), point.ms, point.auc
         is_left = x > (left + right) / 2
-        ends = sorted((x, x + (-1 if is_left else 1) * letter * (len(name) + 3)))
+        length = letter * (len(name) + 3)
+        start, stop = (x - length, x) if is_left else (x, x + length)
         for begin, end, height in sorted(taken, key=lambda label: label[2]):
-            if begin < ends[1] and ends[0] < end and abs(height - y) < line:
+            if begin < stop and start < end and abs(height - y) < line:
                 y = height + line
-        taken.append((*ends, y))
+        taken.append((start, stop, y))
         if y > point.auc:
             axes.plot([x, x], [point.auc, y], color=GREY, linewidth=0.5, zorder=1)
         axes.annotate(
