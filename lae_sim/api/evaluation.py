@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lae_sim._compiled import amount, expect
 from lae_sim.api.inputs import (
     Costs,
     Forecasters,
@@ -102,6 +103,7 @@ class Scenario:
                 progress(len(run))
 
         names = list(self.forecasters)
+        expect(amount(self.trace.frames or 0, len(self.world.sigmas)) * len(names))
         totals, rows = Totals(names.index("hold")), SequenceRows(names)
         for part in evaluate_groups(
             runs(),

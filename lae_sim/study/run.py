@@ -8,11 +8,13 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
+from lae_sim._compiled import amount
 from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
@@ -252,8 +254,13 @@ def _run(
     ]
     failures, computed = [], 0
     workers = min(workers or cores(), max(len(works), 1))
+    frames = {source.input: source.frames for source in plan.sources}
+    share = sum(
+        amount(frames[cell.setting.trace] * cell.setting.count, len(study.sigmas)) for cell in cells
+    )
+    attempted = partial(attempt, share=share // workers)
     # closed whatever happens here, or workers would outlive the study
-    with closing(run_all(attempt, works, workers, scheduler)) as attempts:
+    with closing(run_all(attempted, works, workers, scheduler)) as attempts:
         for done, (work, result) in enumerate(attempts, 1):
             progress("", done, len(works))
             if isinstance(result, Failure):
