@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench samples clean
+.PHONY: demo test lint docs pages bench samples notebooks dist clean
 
 demo: $(VENV)/.demo  ## replay the sample traces
 	$(BIN)/lae-sim replay traces/synthetic-slow.parquet traces/synthetic-fast.parquet
@@ -17,6 +17,12 @@ lint: $(VENV)/.dev  ## format, lint, types and the order of imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: $(VENV)/.docs  ## build the site of docs/ in site/; warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+pages: $(VENV)/.test  ## write the outputs that README.md and docs/ show anew
+	$(BIN)/python tests/pages.py
+
 bench: $(VENV)/.test  ## measure speed and memory
 	$(BIN)/python benchmarks/run.py
 	$(BIN)/python benchmarks/profiling.py
@@ -25,6 +31,14 @@ bench: $(VENV)/.test  ## measure speed and memory
 samples: $(VENV)/.demo  ## make the sample traces anew
 	$(BIN)/python traces/make_samples.py
 	$(BIN)/python traces/make_cases.py
+
+notebooks: $(VENV)/.test  ## run the notebooks, and store them with what they print and draw
+	$(BIN)/python tests/stored_notebooks.py
+
+dist: $(VENV)/.dev  ## build wheel and sdist in dist/, and check them as the index would
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/twine check --strict dist/*
 
 clean:
 	rm -rf $(VENV)
@@ -36,6 +50,6 @@ $(VENV)/.demo: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
-$(VENV)/.test $(VENV)/.dev: $(VENV)/.%: $(BIN)/python pyproject.toml
+$(VENV)/.test $(VENV)/.dev $(VENV)/.docs: $(VENV)/.%: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$*]'
 	touch $@

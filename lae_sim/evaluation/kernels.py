@@ -88,6 +88,19 @@ def used_outputs(
 
 
 @kernel
+def most_pairs(
+    offsets: Ints, output: Ints, sigma_from: Ints, sigma_to: Ints, first: Frames, end: Frames
+) -> int:
+    """No fewer than there are for :func:`list_pairs`, whose arguments these are."""
+    most = 0
+    for h in range(len(offsets) - 1):
+        for item in range(offsets[h], offsets[h + 1]):
+            o = output[item]
+            most += max(end[o, sigma_from[h]] - first[o, sigma_to[h] - 1], 0)
+    return most
+
+
+@kernel
 def list_pairs(
     offsets: Ints,
     output: Ints,

@@ -455,31 +455,14 @@ class Pairs:
 
 def pairs(pairing: Pairing, fed: Histories) -> Pairs:
     """List the distinct pairs of frames and outputs, with the sigmas each is for."""
+    if pairing.steps is not None and pairing.next_steps is not None and compiled():
+        return _pairs_by_kernel(pairing, fed, pairing.steps, pairing.next_steps)
     sizes = np.diff(fed.offsets)
     low, high = np.repeat(fed.sigma_from, sizes), np.repeat(fed.sigma_to, sizes)
     count = len(pairing.sigmas)
     cell = fed.output * count
     begin = pairing.first.take(cell + high - 1).astype(np.int64)
     sizes = np.maximum(pairing.end.take(cell + low) - begin, 0)
-    steps, next_steps = pairing.steps, pairing.next_steps
-    if steps is not None and next_steps is not None and compiled():
-        from lae_sim.evaluation import kernels
-
-        columns = np.empty((4, sizes.sum()), np.int64)
-        count = kernels.list_pairs(
-            fed.offsets,
-            fed.output,
-            fed.sigma_from,
-            fed.sigma_to,
-            pairing.first,
-            pairing.end,
-            steps,
-            next_steps,
-            pairing.scale,
-            pairing.sigmas,
-            columns,
-        )
-        return Pairs(*columns[:, :count])
     item = np.repeat(np.arange(len(low)), sizes)
     frame = ranges(begin, sizes)
     listed = Pairs(item, frame, low.take(item), high.take(item))
@@ -500,6 +483,18 @@ def pairs(pairing: Pairing, fed: Histories) -> Pairs:
         ends[several] = limit(seen, ends.take(several))
     kept = listed.sigma_from < listed.sigma_to
     return listed if kept.all() else listed.some(kept)
+
+
+def _pairs_by_kernel(pairing: Pairing, fed: Histories, steps: Ints, next_steps: Ints) -> Pairs:
+    from lae_sim.evaluation import kernels
+
+    histories = fed.offsets, fed.output, fed.sigma_from, fed.sigma_to
+    answered = pairing.first, pairing.end
+    columns = np.empty((4, kernels.most_pairs(*histories, *answered)), np.int64)
+    sees = steps, next_steps
+    grid = pairing.scale, pairing.sigmas
+    count = kernels.list_pairs(*histories, *answered, *sees, *grid, columns)
+    return Pairs(*columns[:, :count])
 
 
 def _count_above(rows: Frames, row: Ints, values: Ints) -> Ints:

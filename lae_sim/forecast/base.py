@@ -43,6 +43,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.engine.arrivals import FrameTime
 from lae_sim.errors import LaeError, explained
+from lae_sim.plugins import bound, check_methods, with_options
 from lae_sim.trace.metadata import ImageSizes
 
 ImageSize = Optional[tuple[int, int]]
@@ -98,6 +99,9 @@ def resize(forecaster: Forecaster, image_sizes: ImageSizes | None, frame: float)
         forecaster.resize(image_sizes.at(frame))
 
 
+_METHODS = {"update": ("frame", "box"), "predict": ("frame",)}
+
+
 ForecasterFactory = Callable[[Sequence[float], ImageSize], Forecaster]
 """``factory(initial_box, image_size)`` makes the forecaster of one sequence."""
 
@@ -139,6 +143,36 @@ class Lanes:
         """The first item of each item's lane, int64 [P]."""
         first: Ints = self.offsets[self.lane(item)]
         return first
+
+    def firsts(self) -> Ints:
+        """The first item of every item's lane, int64 [N]."""
+        return np.repeat(self.offsets[:-1], np.diff(self.offsets))
+
+    def in_step(self) -> tuple[Ints, Ints]:
+        """The items in time-major order: the k-th of every lane that has one, for each k.
+
+        What goes through all lanes in step works on one stretch of memory at each step: lanes are
+        sorted by length, so those that go on are the first ones of the step before. Three lanes of
+        4, 3 and 1 items:
+
+            lane       in time-major order
+            a0 a1 a2 a3     a0 b0 c0 | a1 b1 | a2 b2 | a3
+            b0 b1 b2        running = 3, 2, 2, 1
+            c0
+
+        Returns:
+            The item at each place of that order, int64 [N], and how many lanes have more than k
+            items, int64 [items of the longest].
+        """
+        lengths = np.diff(self.offsets)
+        longest = np.argsort(-lengths, kind="stable")
+        steps = np.arange(lengths.max(initial=0))
+        running: Ints = np.searchsorted(-lengths[longest], -steps)
+        begins = np.cumsum(running) - running
+        lane = np.arange(len(self.frames)) - np.repeat(begins, running)
+        order: Ints = self.offsets[longest].take(lane)
+        order += np.repeat(steps, running)
+        return order, running
 
     def image_sizes_at(self, item: Ints, frame: Ints | Floats) -> Floats:
         """Width and height of frames' images in the lanes of some items, float64 [P, 2].
@@ -223,6 +257,29 @@ AnyFactory = ForecasterFactory | SequenceFactory
 def factory_for(factory: AnyFactory, sequence: Sequenced) -> ForecasterFactory:
     """The factory of a sequence's forecasters."""
     return factory.for_sequence(sequence) if isinstance(factory, SequenceFactory) else factory
+
+
+def own_factory(what: str, made: Any, options: Mapping[str, Any] | None = None) -> AnyFactory:
+    """The factory that something of a user's is, with options, checked to take what it is given.
+
+    Args:
+        what: what it is, for messages.
+        made: a class of forecasters, or a function that makes one, which takes the options beside
+            the box and the image size; an object that makes forecasters, or a class of such, which
+            takes the options alone.
+        options: keyword arguments.
+
+    Raises:
+        LaeError: if it does not take them, or its forecasters lack a method.
+    """
+    makes = isinstance(made, type) and not hasattr(made, "predict")
+    if makes and ("__call__" in dir(made) or (options and hasattr(made, "for_sequence"))):
+        made, options = bound(what, made, [], options or {}), None
+    if isinstance(made, SequenceFactory):
+        return made
+    if isinstance(made, type):
+        check_methods(what, made, _METHODS)
+    return with_options(what, made, options or {}, ("box", "image_size"))
 
 
 def notes_of(factory: Any, sequences: Sequence[str]) -> list[str]:
@@ -368,9 +425,9 @@ def forecast(
             boxes = np.asarray(factory.forecast_lanes(lanes, item, frame), np.float64)
             if boxes.shape != (len(item), 4):
                 raise LaeError(f"{name}: answered {boxes.shape}, not {(len(item), 4)}")
-            good = np.isfinite(boxes).all(axis=1)
-            if not good.all():
-                box, at = boxes[~good][0], frame[~good][0]
+            if not np.isfinite(boxes).all():
+                bad = int(np.argmin(np.isfinite(boxes).all(axis=1)))
+                box, at = boxes[bad], frame[bad]
                 raise LaeError(f"{name}: predicted {box} for frame {at}, not a box x, y, w, h")
             return boxes
         return _streamed(factory, lanes, item, frame, name, number)
@@ -400,6 +457,7 @@ def _streamed(
             size = lanes.image_sizes[k]
             image_size = (int(size[0]), int(size[1])) if np.isfinite(size).all() else None
             forecaster = factory(lanes.boxes[fed].tolist(), image_size)
+            check_methods(name, forecaster, _METHODS)
         while fed < i:
             fed += 1
             resize(forecaster, lanes.resized.get(k), fed_frames[fed])

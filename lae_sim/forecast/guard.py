@@ -36,6 +36,7 @@ _WORSE, _BETTER = 1.5, 1.1
 # Of the errors, in target sizes, that count for nothing: of x, y, w and h.
 _SLACK = (0.004, 0.004, 0.1, 0.1)
 _MOST = 1.0  # a single error counts for no more, such as that of a jump
+_PART = 1 << 11  # items at once: what is computed on the way stays in the cache
 _FEWEST = 2  # outputs before one can be judged: with the initial box alone every forecast is that
 
 
@@ -87,49 +88,60 @@ class Guarded:
 
     def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once, to the last bit if the base is."""
-        every = np.arange(len(lanes.frames))
-        before = np.maximum(every - 1, lanes.first(every))
+        before = np.maximum(np.arange(len(lanes.frames)) - 1, lanes.firsts())
         both = np.concatenate([item, before])  # asked together, the base works once
         order = np.argsort(both, kind="stable")
         answers = np.empty((len(both), 4))
         frames = np.concatenate([frame, lanes.frames])
         answers[order] = forecast(self.base, lanes, both[order], frames[order])
         boxes, said = answers[: len(item)], answers[len(item) :]
-        held = self._held(lanes, said, lanes.boxes[before])[item]
-        some = held.any(axis=1)
+        held = self._held(lanes, said, lanes.boxes.take(before, axis=0)).take(item, axis=1)
+        some = held.any(axis=0)
         boxes[some] = np.stack(
-            _mixed(boxes[some].T, lanes.boxes[item[some]].T, held[some].T), axis=1
+            _mixed(boxes[some].T, lanes.boxes[item[some]].T, held[:, some]), axis=1
         )
         return boxes
 
     @staticmethod
     def _held(lanes: Lanes, said: Floats, latest: Floats) -> Bools:
-        """In which coordinates hold answers after each item, bool [N, 4].
+        """In which coordinates hold answers after each item, bool [4, N].
 
         Args:
             lanes: what is known.
             said: what the base said of each item's frame before it came, [N, 4].
             latest: the box before, [N, 4].
         """
-        box = lanes.boxes.T
-        errors = [np.stack(_errors(each, box)) for each in (said.T, latest.T)]
-        held = np.zeros((4, len(lanes.frames)), np.bool_)
-        sizes = np.diff(lanes.offsets)
-        order = np.argsort(-sizes, kind="stable")  # the longest first: those that end are the last
-        first, sizes = lanes.offsets[:-1][order], sizes[order]
-        state = np.zeros((4, len(order)), np.bool_)
-        own, holds = np.zeros((4, len(order))), np.zeros((4, len(order)))
+        order, running = lanes.in_step()
+        ends = np.cumsum(running)
+        steps = [  # each with the places of its lanes in the step before
+            (slice(end - n, end), slice(end - n - last, end - last))
+            for last, n, end in zip(
+                running[_FEWEST - 1 :].tolist(),
+                running[_FEWEST:].tolist(),
+                ends[_FEWEST:].tolist(),
+            )
+        ]
+        means = np.empty((4, 2, len(order)))  # of the base and of hold, in time-major order
+        for begin in range(0, len(order), _PART):
+            part = slice(begin, begin + _PART)
+            base, hold, box = (
+                each.take(order[part], axis=0).T for each in (said, latest, lanes.boxes)
+            )
+            errors = _errors(np.stack([base, hold], axis=1), np.ascontiguousarray(box))
+            for mean, error in zip(means, errors):
+                mean[:, part] = _share(error)  # to which that of the steps before is added
+        means[..., : ends[:_FEWEST].max(initial=0)] = 0.0
+        for now, before in steps:
+            means[..., now] += _KEPT * means[..., before]
+        own, holds = means[:, 0], means[:, 1]
         slack = np.array(_SLACK)[:, None]
-        for k in range(_FEWEST, int(sizes[0]) if len(sizes) else 0):
-            n = int(np.searchsorted(-sizes, -k, "left"))
-            at = first[:n] + k
-            own[:, :n] = _faded(own[:, :n], errors[0][:, at])
-            holds[:, :n] = _faded(holds[:, :n], errors[1][:, at])
-            worse = own[:, :n] > _WORSE * holds[:, :n] + slack
-            still = own[:, :n] > _BETTER * holds[:, :n] + 0.5 * slack
-            state[:, :n] = np.where(state[:, :n], still, worse)
-            held[:, at] = state[:, :n]
-        return held.T
+        held = own > _WORSE * holds + slack
+        still = own > _BETTER * holds + 0.5 * slack
+        for now, before in steps:
+            held[:, now] |= held[:, before] & still[:, now]
+        by_item: Bools = np.empty_like(held)
+        by_item[:, order] = held
+        return by_item
 
     def notes(self, sequences: Sequence[str]) -> list[str]:
         """What the base has to say."""
@@ -151,8 +163,8 @@ class _Watched:
         if self._outputs >= _FEWEST:
             own = _errors(self._base.predict(frame), box)
             holds = _errors(self._box, box)
-            self._own = [_faded(a, b) for a, b in zip(self._own, own)]
-            self._holds = [_faded(a, b) for a, b in zip(self._holds, holds)]
+            self._own = [_KEPT * mean + _share(error) for mean, error in zip(self._own, own)]
+            self._holds = [_KEPT * mean + _share(error) for mean, error in zip(self._holds, holds)]
             self._held = [
                 a > (_BETTER * b + 0.5 * slack if held else _WORSE * b + slack)
                 for a, b, slack, held in zip(self._own, self._holds, _SLACK, self._held)
@@ -171,8 +183,9 @@ class _Watched:
             self._base.resize(image_size)
 
 
-def _faded(mean: Number, error: Number) -> Number:
-    return _KEPT * mean + (1.0 - _KEPT) * abs(error)
+def _share(error: Number) -> Number:
+    """What an error adds to its mean."""
+    return (1.0 - _KEPT) * abs(error)
 
 
 def _errors(said: Any, box: Any) -> tuple[Number, ...]:

@@ -338,15 +338,7 @@ def clip(forecasts: Floats, raw: Floats, image_sizes: Floats) -> Floats:
 def filter_lanes(
     lanes: Lanes, settings: TunedKalman = PAPER, restart_iou: float | None = None
 ) -> tuple[Floats, Ints]:
-    """Filter all lanes in step: the k-th output of every lane that has one, for each k.
-
-    So that each step works on one stretch of memory, lanes are sorted by length and items by their
-    place in the lane. Three lanes of 4, 3 and 1 outputs:
-
-        lane       in time-major order
-        a0 a1 a2 a3     a0 b0 c0 | a1 b1 | a2 b2 | a3
-        b0 b1 b2        running = 3, 2, 2, 1; ends = 3, 5, 7, 8
-        c0
+    """Filter all lanes in step (:meth:`.base.Lanes.in_step`).
 
     Args:
         lanes: what the filters are fed.
@@ -357,13 +349,7 @@ def filter_lanes(
         Position and velocity after each item in time-major order, float64 [N, 2, 4], and the place
         of each item there, int64 [N].
     """
-    lengths = np.diff(lanes.offsets)
-    longest = np.argsort(-lengths, kind="stable")
-    running = np.searchsorted(-lengths[longest], -np.arange(lengths.max()))  # with more than k
-    ends = np.cumsum(running)
-    lane = np.arange(ends[-1]) - np.repeat(ends - running, running)
-    order = lanes.offsets[longest].take(lane)
-    order += np.repeat(np.arange(lengths.max()), running)
+    order, running = lanes.in_step()
     interval = np.diff(lanes.frames, prepend=0).astype(np.float64)
     interval[lanes.offsets[:-1]] = 0.0
     interval = interval.take(order)
@@ -373,7 +359,7 @@ def filter_lanes(
     width = int(running[0])
     filters = _Filter(settings, measured[:, :width])
     states[:width] = filters.states.transpose(2, 0, 1)
-    for n, end in zip(running[1:].tolist(), ends[1:].tolist()):
+    for n, end in zip(running[1:].tolist(), np.cumsum(running)[1:].tolist()):
         now = slice(end - n, end)
         if n < width:
             width = n

@@ -8,9 +8,11 @@ regression on past motion is PVT++'s idea (Li et al., "PVT++: A Simple End-to-En
 Visual Tracking Framework", ICCV 2023, Sec. 4); weights over velocities, and training on the overlap
 and on made-up motion, are new here.
 
-Answers are the same bits for one sequence and for thousands, on every processor: the network
-counts in whole numbers (:mod:`lae_sim.forecast.network`), and all else is addition, multiplication,
-division, square roots and rounding, which IEEE 754 defines to the last bit, in one order.
+Answers are the same bits for one sequence and for thousands, on every processor, so that no
+tolerance is needed: the network counts in whole numbers (:mod:`lae_sim.forecast.network`) and sums
+of velocities are of multiples of 2**-20, both exact in any order, whatever BLAS and its threads do;
+all else is addition, multiplication, division, square roots and rounding, which IEEE 754 defines to
+the last bit, number by number in one order.
 Logarithms are not defined so: sizes change by r = 2 (b - a) / (b + a), which is about log(b / a),
 and of which b = a (2 + r) / (2 - r) is the inverse.
 """
@@ -18,7 +20,7 @@ and of which b = a (2 + r) / (2 - r) is the inverse.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,7 +52,7 @@ MIXING = 2 * RATES * VELOCITIES
 OUTPUTS = MIXING + 4 * RATES + 4
 _FINE = 2.0**20  # velocities are multiples of its inverse, so that sums of them are exact
 _FASTEST = 8.0
-_PART = 1 << 12  # items at once: windows take much memory, and small ones stay in the cache
+_PART = 1024
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class Place:
 
     def chosen(self, which: Ints) -> Place:
         """Some of the places."""
-        return Place(*(each[which] for each in (self.x, self.y, self.w, self.h, self.size)))
+        return Place(*(each.take(which) for each in (self.x, self.y, self.w, self.h, self.size)))
 
     def velocity(self, before: Place, interval: Number) -> tuple[Number, ...]:
         """Of the centre in sizes per frame, of the sides as ratios per frame, after an interval."""
@@ -109,11 +111,11 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Past:
-    """The motion that led to each of N outputs.
+    """The motion that led to each of N outputs, a row for each of its numbers.
 
     Attributes:
         place: where the target is then, arrays [N].
-        velocity: see :meth:`Place.velocity`, [N, 4]; 0 for the first of a lane.
+        velocity: see :meth:`Place.velocity`, [4, N]; 0 for the first of a lane.
         interval: frames since the output before, [N]; 0 for the first of a lane.
         first: first item of each one's lane, int64 [N].
     """
@@ -126,14 +128,13 @@ class Past:
     @classmethod
     def of(cls, lanes: Lanes) -> Past:
         """The motion of some lanes."""
-        every = np.arange(len(lanes.frames))
-        first = lanes.first(every)
+        every, first = np.arange(len(lanes.frames)), lanes.firsts()
         before = np.maximum(every - 1, first)
         place = Place.of(*lanes.boxes.T)
         interval = (lanes.frames - lanes.frames[before]).astype(np.float64)
         since = np.where(interval > 0, interval, 1.0)
-        velocity = np.stack(place.velocity(place.chosen(before), since), axis=1)
-        velocity[interval <= 0] = 0.0
+        velocity = np.stack(place.velocity(place.chosen(before), since))
+        velocity[:, interval <= 0] = 0.0
         return cls(place, velocity, np.maximum(interval, 0.0), first)
 
     def window(self, item: Ints) -> Ints:
@@ -149,9 +150,8 @@ class Past:
 
 
 def rows_of(velocity: Floats, interval: Floats) -> Floats:
-    """What the network sees of velocities [..., 4] after intervals [...], [..., 6]."""
-    known = np.where(interval > 0, ONE, 0.0)
-    return np.stack([*_row(np.moveaxis(velocity, -1, 0), interval), known], axis=-1)
+    """What the network sees of velocities [4, ...] after intervals [...], [6, ...]."""
+    return np.stack([*_row(velocity, interval), np.where(interval > 0, ONE, 0.0)])
 
 
 def _row(velocity: Sequence[Number] | Floats, interval: Number) -> tuple[Number, ...]:
@@ -161,12 +161,42 @@ def _row(velocity: Sequence[Number] | Floats, interval: Number) -> tuple[Number,
     return *(nearest(each * ONE) for each in bent), nearest(interval / (interval + 4.0) * ONE)
 
 
+_LEAD = VELOCITIES - 1  # columns of zeros before the first item, to which windows may reach back
+
+
+def _led(rows: Floats) -> Floats:
+    """Rows [k, N] after the leading zeros, [k, _LEAD + N]."""
+    return np.concatenate([np.zeros((len(rows), _LEAD)), rows], axis=1)
+
+
+def _lag(rows: Floats, begin: int, out: Floats) -> None:
+    """Write the columns of the last outputs as of each of some items, newest first.
+
+    They are slices of the rows, which takes far less time than to gather them. As of a lane's first
+    items some are of the lane before; there is nothing then. Two lanes, a and b:
+
+        rows        a0 a1 a2 b0 b1 b2
+        out[0]      a0 a1 a2 b0 b1 b2
+        out[1]      .  a0 a1 a2 b0 b1       a2: nothing
+        out[2]      .  .  a0 a1 a2 b0       a1, a2: nothing
+
+    Args:
+        rows: of all items, [k, _LEAD + N]; see :func:`_led`.
+        begin: the first of the items.
+        out: [VELOCITIES, k, n].
+    """
+    for k, columns in enumerate(out):
+        last = begin + _LEAD - k
+        columns[:] = rows[:, last : last + columns.shape[1]]
+
+
 def mirrored(motion: Floats) -> Floats:
-    """By what to multiply x and y so that motions [n, VELOCITIES, 4] go right and down, [n, 2].
+    """By what to multiply x and y so that motions [VELOCITIES, 4, ...] go right and down, [2, ...].
 
     By 0 if they go neither way: of a mirrored world everything is mirrored, of one at rest too.
     """
-    return np.sign(_FADING @ motion[..., :2])
+    signs: Floats = np.sign(sum(part * each for part, each in zip(_FADING, motion[:, :2])))
+    return signs
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,33 +228,51 @@ class Learned:
     def forecast_lanes(self, lanes: Lanes, item: Ints, frame: Ints | Floats) -> Floats:
         """The same for many lanes at once, to the last bit."""
         past = Past.of(lanes)
-        rates, offsets = self._outlooks(past)
         ahead = (frame - lanes.frames[item]).astype(np.float64)
-        boxes = lanes.boxes[item]
+        boxes: Floats = lanes.boxes.take(item, axis=0)
         asked = np.flatnonzero((ahead > 0) & (item > past.first[item]))  # else nothing has moved
-        which = item[asked]
-        moved = past.place.chosen(which).moved(
-            rates[which].transpose(1, 2, 0), offsets[which].T, ahead[asked]
-        )
-        boxes[asked] = np.stack(moved, axis=1)
+        item, ahead = item[asked], ahead[asked]
+        for part, rates, offset in self._outlooks(past):
+            some = slice(*np.searchsorted(item, [part.start, part.stop]))
+            place, at = past.place.chosen(item[some]), item[some] - part.start
+            moved = place.moved(
+                [[each.take(at) for each in row] for row in rates],
+                [each.take(at) for each in offset],
+                ahead[some],
+            )
+            boxes[asked[some]] = np.stack(moved, axis=1)
         return boxes
 
-    def _outlooks(self, past: Past) -> tuple[Floats, Floats]:
-        """The rates [N, RATES, 4] and offsets [N, 4] after each item."""
-        rows, count = rows_of(past.velocity, past.interval), len(past.first)
-        every = np.arange(count)
-        shape = np.stack(past.place.shape((every - past.first).astype(np.float64)), axis=1)
-        rates, offsets = np.empty((count, RATES, 4)), np.empty((count, 4))
+    def _outlooks(self, past: Past) -> Iterator[tuple[slice, list[list[Floats]], list[Floats]]]:
+        """The rates and offsets after each item of a part of them, one part after another."""
+        count = len(past.first)
+        age = np.arange(count) - past.first
+        velocity = _led(past.velocity)
+        rows = _led(rows_of(past.velocity, past.interval))
+        shape = np.stack(past.place.shape(age.astype(np.float64)))
+        motions, sights = np.empty((VELOCITIES, 4, _PART)), np.empty((INPUTS, _PART))
+        windows = sights[:-3].reshape(VELOCITIES + STARTS, _SEEN, _PART)
         for begin in range(0, count, _PART):
-            item = every[begin : begin + _PART]
-            window = past.window(item)
-            motion = past.velocity[window[:, :VELOCITIES]]
+            part = slice(begin, min(begin + _PART, count))
+            n, old = part.stop - begin, age[part]
+            motion, inputs, seen = motions[..., :n], sights[:, :n], windows[..., :n]
+            none, at = np.nonzero(old < np.arange(VELOCITIES)[:, None])
+            for last, out in ((velocity, motion), (rows, seen[:VELOCITIES])):
+                _lag(last, begin, out)
+                out[none, :, at] = 0.0
+            for k in range(STARTS):
+                opening = past.first[part] + np.where(old > k, k + 1, 0)
+                seen[VELOCITIES + k] = rows.take(_LEAD + opening, axis=1)
             mirror = mirrored(motion)
-            seen = rows[window]
-            seen[..., :2] *= mirror[:, None]
-            inputs = np.concatenate([seen.reshape(len(item), -1), shape[item]], axis=1)
-            rates[item], offsets[item] = _outlook(self.network(inputs), motion, mirror)
-        return rates, offsets
+            seen[:, :2] *= mirror
+            inputs[-3:] = shape[:, part]
+            answers = self.network(inputs)
+            mixed = np.einsum(
+                "srvn,vscn->rscn",
+                answers[:MIXING].reshape(2, RATES, VELOCITIES, n),
+                motion.reshape(VELOCITIES, 2, 2, n),
+            ).reshape(RATES, 4, n)
+            yield part, *_outlook(mixed, answers[MIXING:], mirror)
 
 
 _FADING = 0.5 ** np.arange(VELOCITIES)
@@ -237,29 +285,30 @@ for _factor in (0, -1):
     _MIRRORS[:, _factor, 1:-3:_SEEN] = _factor
 
 
-def _outlook(answers: Floats, motion: Floats, mirror: Floats) -> tuple[Floats, Floats]:
-    """What the network's answers mean; all of it is exact.
+def _outlook(
+    mixed: Any, more: Any, mirror: Sequence[Number] | Floats
+) -> tuple[list[list[Number]], list[Number]]:
+    """What the network's answers mean, in numbers or arrays; all of it is exact.
 
     Args:
-        answers: of the network, [n, OUTPUTS].
-        motion: the last velocities, newest first, [n, VELOCITIES, 4].
-        mirror: by what x and y were multiplied, see :func:`mirrored`, [n, 2].
+        mixed: sums of velocities by the network's weights, [RATES][4]; ``ONE`` is 1.
+        more: its other answers, corrections of these and offsets, [4 * RATES + 4]; ``ONE`` is 1.
+        mirror: by what x and y were multiplied, see :func:`mirrored`, [2].
 
     Returns:
-        Rates [n, RATES, 4] and offsets [n, 4] for :meth:`Place.moved`.
+        Rates [RATES][4] and offsets [4] for :meth:`Place.moved`.
     """
-    answers = answers / ONE
-    weights = answers[:, :MIXING].reshape(-1, 2 * RATES, VELOCITIES)
-    mixed = weights @ motion
-    mixed[:, :RATES, 2:] = mixed[:, RATES:, 2:]
-    turned = np.ones((len(mirror), 4))
-    turned[:, :2] = mirror
-    more = CORRECTION * answers[:, MIXING:-4].reshape(-1, RATES, 4)
-    return mixed[:, :RATES] + more * turned[:, None], OFFSET * answers[:, -4:] * turned
+    x, y = mirror
+    more = [each * turn for each, turn in zip(more, [x, y, 1.0, 1.0] * (RATES + 1))]
+    rates = [
+        [mix / ONE + CORRECTION / ONE * each for mix, each in zip(row, more[4 * k :])]
+        for k, row in enumerate(mixed)
+    ]
+    return rates, [OFFSET / ONE * each for each in more[-4:]]
 
 
 class _Following:
-    """The streaming form, with one row of the arrays above."""
+    """The streaming form, with one column of the arrays above."""
 
     def __init__(self, network: Network, box: Sequence[float]) -> None:
         self._network = network
@@ -276,8 +325,8 @@ class _Following:
         """Take in the box of a newer frame."""
         place, interval = Place.of(*map(float, box)), float(frame - self._frame)
         inputs, motion, seen_last = self._inputs, self._motion, _SEEN * VELOCITIES
-        inputs[_SEEN:seen_last] = inputs[: seen_last - _SEEN].copy()
-        motion[1:] = motion[:-1].copy()
+        inputs[_SEEN:seen_last] = inputs[: seen_last - _SEEN]
+        motion[1:] = motion[:-1]
         inputs[:_SEEN], motion[0] = 0.0, 0.0
         if interval > 0:
             velocity = place.velocity(self._place, interval)
@@ -289,10 +338,12 @@ class _Following:
             inputs[at : at + _SEEN] = inputs[:_SEEN]
         inputs[-3:] = place.shape(float(self._count))
         self._box, self._frame, self._place = box, frame, place
-        mirror = mirrored(motion)
-        shown = inputs * _MIRRORS[int(mirror[0]), int(mirror[1])]
-        rates, offset = _outlook(self._network(shown[None]), motion[None], mirror[None])
-        self._rates, self._offset = rates[0].tolist(), offset[0].tolist()
+        x, y = _FADING.dot(motion).tolist()[:2]
+        mirror = (x > 0) - (x < 0), (y > 0) - (y < 0)
+        answers = self._network(inputs * _MIRRORS[mirror])
+        mixed = answers[:MIXING].reshape(2 * RATES, VELOCITIES).dot(motion).tolist()
+        mixed = [[*row[:2], *other[2:]] for row, other in zip(mixed, mixed[RATES:])]
+        self._rates, self._offset = _outlook(mixed, answers[MIXING:].tolist(), mirror)
 
     def predict(self, frame: int) -> Sequence[float]:
         """The box at a frame, from the boxes so far."""
@@ -318,7 +369,8 @@ def read_learned(path: str | os.PathLike[str]) -> Learned:
 def shipped() -> Guarded:
     """The forecaster that comes with the package, guarded.
 
-    ``lae-sim train --made-up`` made its weights (README, "Forecasters"): no real motion is in them.
+    ``lae-sim train --made-up`` made its weights: no real motion is in them
+    (docs/concepts/forecasters.md).
     """
     return Guarded(read_learned(SHIPPED))
 

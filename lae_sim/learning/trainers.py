@@ -12,7 +12,7 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, install
 from lae_sim.forecast.base import AnyFactory, ForecasterFactory
 from lae_sim.forecast.kalman import PAPER
 from lae_sim.forecast.learned import (
@@ -150,7 +150,7 @@ def import_torch() -> Any:
     try:
         import torch
     except ImportError as error:
-        raise LaeError("training needs torch: pip install 'lae-sim[torch]'") from error
+        raise LaeError(f"training needs torch: {install('torch')}") from error
     return torch
 
 
@@ -189,7 +189,7 @@ class _Batch:
         offset = goals[..., :2] + goals[..., 2:] / 2 - centre[:, None]
         parts = np.concatenate([offset, goals[..., 2:], sides], axis=2)
         return cls(
-            past.velocity[window],
+            past.velocity.T[window],
             past.interval[window],
             np.stack(shape, axis=1),
             (parts / place.size[:, None, None]).astype(np.float32),
@@ -207,8 +207,8 @@ class _Batch:
 
     def change(self, torch: Any, network: Any, ahead: Floats) -> Any:
         """What the network says of each: change of centre and sides, [P, 4]."""
-        mirror = mirrored(self.motion[:, :VELOCITIES])
-        rows = rows_of(self.motion, self.interval)
+        mirror = mirrored(self.motion[:, :VELOCITIES].transpose(1, 2, 0)).T
+        rows = np.moveaxis(rows_of(np.moveaxis(self.motion, -1, 0), self.interval), 0, -1)
         rows[..., :2] *= mirror[:, None]
         inputs = np.concatenate([rows.reshape(len(rows), -1), self.shape], axis=1) / ONE
         near, mirror, motion, inputs = (

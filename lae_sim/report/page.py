@@ -18,11 +18,13 @@ from typing import TYPE_CHECKING, Any
 from lae_sim import __version__
 from lae_sim.errors import visible
 from lae_sim.evaluation.metrics import CONVENTIONS, Convention
+from lae_sim.figures import study as study_figures
+from lae_sim.figures.study import SWEEPS, Picture
 from lae_sim.files import written_whole
-from lae_sim.report import study_figures, study_tables
-from lae_sim.report.study_figures import SWEEPS, Picture
-from lae_sim.report.study_view import View
+from lae_sim.report import study_tables
 from lae_sim.report.table import COUNT, PERCENT, Column, Number, Table
+from lae_sim.study.verdict import shortfalls
+from lae_sim.study.view import View
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
@@ -121,6 +123,7 @@ def page(view: View) -> str:
     datasets = dict.fromkeys(visible(row.dataset) for row in view.results.summary)
     return environment.get_template("page.html").render(
         title=f"Latency-aware study: {', '.join(datasets)}",
+        conclusion=view.results.verdict(),
         facts=_facts(view),
         sections=[section for section in _sections(view) if not section.is_empty],
         style=page_file("page.css"),
@@ -156,7 +159,8 @@ def _facts(view: View) -> dict[str, str]:
         **_search_facts(results),
         "initialisation": "; ".join(results.init_sources()),
         "uncertainty": "[ ]: 95 % percentile bootstrap over sequences, seed "
-        f"{results.plan.study.seed}",
+        f"{results.plan.study.seed}; p: Wilcoxon's signed-rank test, in the conclusion corrected "
+        "by Holm's method for the number of those compared with the best",
         "made with": f"lae_sim {__version__}",
     }
     made_up = [
@@ -196,7 +200,8 @@ def _sections(view: View) -> Iterator[Section]:
         yield Section("comparisons", "Trackers against each other", table=compared)
     if results.required:
         required = study_tables.required_table(view)
-        yield Section("required", "What the required AUC asks for", table=required)
+        texts = shortfalls(results.required, view.names)
+        yield Section("required", "What the required AUC asks for", texts=texts, table=required)
     histograms = _drawn(study_figures.histograms(view))
     yield Section("times", "Processing times", pictures=histograms, table=_times(results))
     digests = {source.input.label: source.input.digest for source in results.plan.sources}

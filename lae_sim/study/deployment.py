@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -20,8 +22,12 @@ from lae_sim.trace.file import Trace, held, read_trace
 
 STEP = Fraction(1, 100)
 MOST = 1 << 13
-"""Scales are looked for in hundredths, up to 81.92: all times so much longer."""
+"""Scales are tried in hundredths, up to 81.92: all times so much longer."""
 
+FINE = 10
+"""Scales that are tried between two coarse ones, at most, where only one of them is enough."""
+
+_GROWTH = 1.15  # of the coarse scales
 _RELATIVE = ("latest", "fifo", "every")  # policies that know no absolute times
 
 HELD = 1_000_000
@@ -30,25 +36,26 @@ HELD = 1_000_000
 
 @dataclass(frozen=True)
 class Search:
-    """The search for the slowest device on which a tracker still has a mean AUC.
+    """The search for how slow a device may be for a tracker still to have some mean AUCs.
 
     Attributes:
         cell: what is replayed, at other scales than its own, at its first sigma.
-        required: the mean AUC.
+        required: the mean AUCs, ascending.
         factory: the cell's forecaster.
     """
 
     cell: Cell
-    required: Fraction
+    required: tuple[Fraction, ...]
     factory: AnyFactory = Hold
 
     @property
     def key(self) -> str:
         """Digest of all that the answer depends on."""
-        return text_digest(f"{self.cell.key} {self.required} {STEP} {MOST}")
+        asked = " ".join(map(str, self.required))
+        return text_digest(f"{self.cell.key} {asked} {STEP} {MOST} {FINE} {_GROWTH}")
 
 
-def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
+def searches(cells: Sequence[Cell], required: Sequence[Fraction]) -> list[Search]:
     """One search for all cells that differ in their scale or repetitions alone."""
     counts: dict[Cell, int] = {}
     for cell in cells:
@@ -58,69 +65,123 @@ def searches(cells: Sequence[Cell], required: Fraction) -> list[Search]:
         alike = replace(cell, setting=setting)
         counts[alike] = max(counts.get(alike, 1), cell.setting.first + cell.setting.count)
     return [
-        Search(replace(cell, setting=replace(cell.setting, count=count)), required)
+        Search(replace(cell, setting=replace(cell.setting, count=count)), tuple(sorted(required)))
         for cell, count in counts.items()
     ]
 
 
 @dataclass(frozen=True)
-class Slowest:
-    """The answer to a search.
+class Curve:
+    """The mean AUC at the scales that were tried.
 
     Attributes:
-        auc_without_latency: the mean AUC at scale 0.
-        scale: the largest scale at which it is what is required, as text; None if there is none.
-        auc: the mean AUC there.
-        beyond: the hundredth after it, as text; None if the largest that is tried is enough.
-        beyond_auc: the mean AUC there.
+        steps: the scales in hundredths, ascending, from 0 on.
+        auc: the mean AUC at each.
+        elapsed_ms: the mean time of a call but the initialisation at each; None without a call.
         modelled: whether these are modelled: wherever a replay is not exact, its reach is known.
     """
 
-    auc_without_latency: float
-    scale: str | None = None
-    auc: float | None = None
-    beyond: str | None = None
-    beyond_auc: float | None = None
+    steps: Sequence[int]
+    auc: Sequence[float]
+    elapsed_ms: Sequence[float | None]
     modelled: bool = False
 
+    def stretches(self, required: Fraction) -> list[tuple[int, int]]:
+        """The first and last place of each row of scales at which the AUC is what is required."""
+        enough = [auc >= required for auc in self.auc]
+        first = [i for i, here in enumerate(enough) if here and not (i and enough[i - 1])]
+        last = [i for i, here in enumerate(enough) if here and not any(enough[i + 1 : i + 2])]
+        return list(zip(first, last))
 
-def slowest(search: Search) -> Slowest:
-    """The largest scale of all times at which the mean AUC is what is required.
 
-    By bisection over hundredths, as if the AUC fell with every step; the scale and the next one are
-    both replayed, so that what is said of these two is exact.
-    """
-    known: dict[int, float] = {}
-    modelled = False
+def measured(search: Search) -> Curve:
+    """The mean AUC at as many scales as it takes to say where it is what is required."""
     setting = search.cell.setting
     trace = held(read_trace(setting.trace.path, setting.sequences or None), HELD)
+    found: dict[int, tuple[float, float | None, bool]] = {}
 
-    def enough(step: int) -> bool:
-        nonlocal modelled
+    def auc(step: int) -> float:
+        found[step] = mean_auc(search, step * STEP, trace)
+        return found[step][0]
+
+    tried = scan(auc, search.required)
+    elapsed = [found[step][1] for step in tried]
+    return Curve([*tried], [*tried.values()], elapsed, any(by for _, _, by in found.values()))
+
+
+def scan(auc: Callable[[int], float], required: Sequence[Fraction]) -> dict[int, float]:
+    """The AUC at scales in hundredths, by scale, ascending; dense where it crosses what is asked.
+
+    No order is assumed: stalls, and calls that come into step with the camera, make the AUC rise
+    with slower times. Those are tried that bisection would (:func:`bisected`); coarse scales, each
+    some 15 % above the one before, up to twice the last that is enough; between two of which one
+    only is enough, `FINE` in an even distance; and each change between these is followed to the
+    hundredth. (What comes and goes between two coarse scales is not seen.)
+    """
+    known: dict[int, float] = {}
+
+    def enough(step: int, least: Fraction) -> bool:
         if step not in known:
-            known[step], by_model = mean_auc(search, step * STEP, trace)
-            modelled = modelled or by_model
-        return known[step] >= search.required
+            known[step] = auc(step)
+        return known[step] >= least
 
+    for least in required:
+        bisected(partial(enough, least=least))
+    last = round(1 / STEP)
+    for step in _coarse():
+        if enough(step, min(required)):
+            last = max(last, step)
+        if step >= 2 * last:
+            break
+
+    def changes() -> list[tuple[int, int]]:
+        """Neighbours of which one only is enough for something."""
+        pairs = list(pairwise(sorted(known)))
+        return [
+            (low, high)
+            for least in required
+            for low, high in pairs
+            if high - low > 1 and enough(low, least) != enough(high, least)
+        ]
+
+    for low, high in changes():
+        for step in range(low, high, -((low - high) // FINE)):
+            enough(step, required[0])
+    while crossings := changes():  # halved until they are neighbouring hundredths
+        for low, high in crossings:
+            enough((low + high) // 2, required[0])
+    return dict(sorted(known.items()))
+
+
+def bisected(enough: Callable[[int], bool]) -> tuple[int | None, int | None]:
+    """The last scale that is enough and the hundredth after, as if none after it were.
+
+    None for the first where no latency at all is not enough, for the second where the largest is.
+    """
     if not enough(0):
-        return Slowest(known[0], beyond="0", beyond_auc=known[0], modelled=modelled)
+        return None, 0
     low, high = 0, 1
     while enough(high) and high < MOST:
         low, high = high, 2 * high
     if enough(high):
-        return Slowest(known[0], str(high * STEP), known[high], modelled=modelled)
+        return high, None
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if enough(middle) else (low, middle)
-    ends = str(low * STEP), known[low], str(high * STEP), known[high]
-    return Slowest(known[0], *ends, modelled=modelled)
+    return low, high
 
 
-def mean_auc(search: Search, scale: Fraction, trace: Trace) -> tuple[float, bool]:
+def _coarse() -> list[int]:
+    """0, and scales in hundredths from 0.01 to the largest, 1 among them."""
+    steps = [round(100 * _GROWTH**k) for k in range(-16, 32)]
+    return [0, 1, *(step for step in steps if step < MOST), MOST]
+
+
+def mean_auc(search: Search, scale: Fraction, trace: Trace) -> tuple[float, float | None, bool]:
     """The mean AUC over sequences and repetitions at a scale of all times.
 
-    It is the one by which the replay would be ranked (:class:`.modelled.Ranking`), and whether that
-    is the modelled one.
+    It is the one by which the replay would be ranked (:class:`.modelled.Ranking`). With it: the
+    mean time of a call but the initialisation, in ms, and whether the AUC is the modelled one.
     """
     cell = search.cell
     setting = replace(cell.setting, world=replace(cell.setting.world, scale=scale))
@@ -141,18 +202,25 @@ def mean_auc(search: Search, scale: Fraction, trace: Trace) -> tuple[float, bool
     )
     if np.isnan(scores).all():
         raise LaeError("no sequence counts in the mean AUC: its truth is nowhere valid")
-    return float(np.nanmean(scores)), modelled
+    calls = np.concatenate([part.replay.processed - 1 for part in parts])
+    elapsed = np.concatenate([part.replay.calls_ns for part in parts])[calls > 0]
+    mean_ms = float((elapsed / calls[calls > 0]).mean()) / 1e6 if len(elapsed) else None
+    return float(np.nanmean(scores)), mean_ms, modelled
 
 
-def requirement(search: Search, answer: Slowest) -> Requirement:
-    """What the required AUC asks for.
+def requirement(search: Search, curve: Curve, required: Fraction) -> Requirement:
+    """What a required AUC asks for.
 
     Where no time is absolute, as a cost or an expected time of a policy is, a schedule depends on
     processing times in frames alone: times scaled by f are a world that moves f times as fast, with
     the recorded motion from frame to frame (but for the rounding to whole ns).
     """
     setting = search.cell.setting
-    scale, beyond = (None if x is None else Fraction(x) for x in (answer.scale, answer.beyond))
+    scales, auc = [step * STEP for step in curve.steps], dict(zip(curve.steps, curve.auc))
+    stretches = curve.stretches(required)
+    last, beyond = bisected(lambda step: auc[step] >= required)
+    scale = None if last is None else last * STEP
+    safe = _nearest(stretches, scales)
     relative = search.cell.cost_ns == 0 and setting.policy.split(":")[0] in _RELATIVE
     return Requirement(
         trace=setting.trace.label,
@@ -165,13 +233,28 @@ def requirement(search: Search, answer: Slowest) -> Requirement:
         convention=search.cell.convention,
         forecaster=search.cell.forecaster,
         sigma=setting.world.sigmas[0],
-        required_auc=float(search.required),
+        required_auc=float(required),
         scale=scale,
-        auc=answer.auc,
-        beyond=beyond,
-        beyond_auc=answer.beyond_auc,
-        auc_without_latency=answer.auc_without_latency,
+        auc=None if last is None else auc[last],
+        beyond=None if beyond is None else beyond * STEP,
+        beyond_auc=None if beyond is None else auc[beyond],
+        auc_without_latency=curve.auc[0],
         speed_up=None if not scale else float(1 / scale),
         fps_at_most=float(scale * setting.fps) if scale is not None and relative else None,
-        ranked_by="modelled" if answer.modelled else "recorded",
+        ranked_by="modelled" if curve.modelled else "recorded",
+        safe_scale=None if safe is None else scales[safe],
+        safe_auc=None if safe is None else curve.auc[safe],
+        safe_ms_per_frame=None if safe is None else curve.elapsed_ms[safe] or None,
+        next_auc=None if safe is None or safe + 1 == len(scales) else curve.auc[safe + 1],
+        stretches=tuple((scales[a], scales[b]) for a, b in stretches),
     )
+
+
+def _nearest(stretches: Sequence[tuple[int, int]], scales: Sequence[Fraction]) -> int | None:
+    """The place of the slowest scale in the stretch that scale 1 is in.
+
+    Else in the last below it that is more than no latency at all, else in the first above.
+    """
+    timed = [(a, b) for a, b in stretches if scales[b] > 0] or stretches
+    before = [b for a, b in timed if scales[a] <= 1]
+    return before[-1] if before else timed[0][1] if timed else None

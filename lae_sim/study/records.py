@@ -15,6 +15,11 @@ MEAN = "mean"
 Plain = str | int | float | None
 
 
+def run_name(trace: str, times_from: str) -> str:
+    """The name of a trace with its times: that of another trace too, if they come from there."""
+    return trace if times_from == trace else f"{trace} at {times_from}"
+
+
 class Record:
     """What the results of a study consist of."""
 
@@ -67,6 +72,32 @@ class Uncertainty:
             if self.recovered.interval is not None:
                 row |= self.recovered.interval.columns(name)
         return dict(row)
+
+
+@dataclass(frozen=True)
+class Behind:
+    """How far a tracker and forecaster is behind the best of its setting.
+
+    Attributes:
+        best: run and forecaster of the best.
+        difference: of the mean AUC that is ranked, to the best's, paired over the sequences.
+        p_holm: p of the difference, corrected for the number of those compared with the best.
+    """
+
+    best: tuple[str, str]
+    difference: Difference
+    p_holm: float
+
+    def columns(self) -> dict[str, Plain]:
+        """Values by their keys in a flat row."""
+        name = "vs_best_auc"
+        return {
+            "best": " with ".join(self.best),
+            name: self.difference.value,
+            **self.difference.interval.columns(name),
+            f"{name}_p": self.difference.p,
+            f"{name}_p_holm": self.p_holm,
+        }
 
 
 @dataclass(frozen=True)
@@ -148,6 +179,8 @@ class SummaryRow(Record):
         ranked_by: ``"modelled"`` or ``"recorded"`` (see
             :class:`lae_sim.evaluation.modelled.Ranking`).
         pareto: whether no other trace is both faster and better.
+        behind: how far it is behind the best; None of the best itself, and in rows without
+            intervals.
     """
 
     trace: str
@@ -180,6 +213,12 @@ class SummaryRow(Record):
     modelled: Modelled | None = None
     ranked_by: str = "recorded"
     pareto: bool = False
+    behind: Behind | None = None
+
+    @property
+    def run(self) -> str:
+        """The trace, and where its times come from, if from another."""
+        return run_name(self.trace, self.times_from)
 
     def score(self, metric: str) -> float | None:
         """Mean AUC or DP as it is ranked: modelled, or of the recorded boxes."""
@@ -202,7 +241,8 @@ class SummaryRow(Record):
             row |= self.staleness.columns()
         if self.modelled is not None:
             row |= self.modelled.columns()
-        return {**row, "ranked_by": self.ranked_by, "pareto": self.pareto}
+        row |= {"ranked_by": self.ranked_by, "pareto": self.pareto}
+        return row if self.behind is None else row | self.behind.columns()
 
 
 @dataclass(frozen=True)
@@ -263,8 +303,8 @@ class Requirement(Record):
         trace, times_from, policy, fps, latency, search, pre_forecaster, convention, forecaster,
             sigma: where it is asked.
         required_auc: the mean AUC.
-        scale: the largest scale of all times at which it is reached, in hundredths; None if it is
-            not even without latency.
+        scale: the scale of all times, in hundredths, at which bisection ends, as if the AUC fell
+            steadily (as version 0.1 has it); None if it is not even reached without latency.
         auc: the mean AUC there.
         beyond: the hundredth after it; None if the largest that is tried is enough.
         beyond_auc: the mean AUC there, too low.
@@ -273,6 +313,13 @@ class Requirement(Record):
         fps_at_most: how fast the world may move, with the recorded motion from frame to frame;
             None where a cost or a policy has a time of its own.
         ranked_by: whose AUC it is, ``"modelled"`` or ``"recorded"``.
+        safe_scale: the scale up to which times may be stretched from 1 on and the AUC is reached at
+            every scale tried on the way; where it is not at 1, the largest below at which it is.
+            It is `scale` wherever the AUC falls steadily.
+        safe_auc, next_auc: the mean AUC there, and one hundredth after.
+        safe_ms_per_frame: mean time of a call there, the initialisations apart; None without a
+            call, and where only no latency at all is enough.
+        stretches: the first and last of each row of scales tried at which the AUC is reached.
     """
 
     trace: str
@@ -294,6 +341,29 @@ class Requirement(Record):
     speed_up: float | None
     fps_at_most: float | None
     ranked_by: str = "recorded"
+    safe_scale: Fraction | None = None
+    safe_auc: float | None = None
+    next_auc: float | None = None
+    safe_ms_per_frame: float | None = None
+    stretches: tuple[tuple[Fraction, Fraction], ...] = ()
+
+    @property
+    def run(self) -> str:
+        """The trace, and where its times come from, if from another."""
+        return run_name(self.trace, self.times_from)
+
+    @property
+    def safe_frames_per_second(self) -> float | None:
+        """How many frames a tracker processes per second at `safe_ms_per_frame`."""
+        return None if self.safe_ms_per_frame is None else 1000 / self.safe_ms_per_frame
+
+    def flat(self) -> dict[str, Plain]:
+        """The flat row of JSON and CSV."""
+        return {
+            **_plain(self, until="stretches"),
+            "safe_frames_per_second": self.safe_frames_per_second,
+            "stretches": ", ".join(f"{float(a):g} to {float(b):g}" for a, b in self.stretches),
+        }
 
 
 @dataclass(frozen=True)

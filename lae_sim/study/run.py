@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -16,14 +18,15 @@ from typing import TYPE_CHECKING, Any, cast
 from lae_sim import __version__
 from lae_sim._compiled import amount
 from lae_sim.errors import LaeError
+from lae_sim.evaluation.caveats import at_the_floor, floor_notes
 from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
 from lae_sim.study.cells import Task
-from lae_sim.study.deployment import Slowest, requirement, searches
+from lae_sim.study.deployment import Curve, requirement, searches
 from lae_sim.study.executors import cores, run_all
 from lae_sim.study.plan import Plan, make_plan, tasks
-from lae_sim.study.records import Comparison, Failure, Record, Requirement, SummaryRow
+from lae_sim.study.records import MEAN, Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
 from lae_sim.study.store import Store
 from lae_sim.study.summary import (
@@ -33,6 +36,7 @@ from lae_sim.study.summary import (
     read_scores,
     summarise_study,
 )
+from lae_sim.study.verdict import verdict
 from lae_sim.study.work import Description, Work, attempt
 from lae_sim.trace.describe import is_measured
 
@@ -71,6 +75,8 @@ class StudyResults:
           forecaster    auc  vs_hold_auc
         0       hold  0.572          NaN
         1     kalman  0.629        0.057
+        >>> print(*results.verdict())
+        slow-and-accurate with kalman is best: AUC 0.629 [0.573, 0.687]; no difference shown: ...
     """
 
     folder: Path
@@ -97,6 +103,20 @@ class StudyResults:
         import pandas as pd
 
         return pd.DataFrame(flat_rows(self.summary))
+
+    def scores_frame(self) -> DataFrame:
+        """The summary with all numbers as numbers.
+
+        World rates and scales are floats, and so is sigma, which is unknown where scores are means
+        over the grid of sigmas; ``over_sigmas`` says so.
+        """
+        table = self.summary_frame()
+        numbers = {
+            name: [float(Fraction(text)) for text in table[name]] for name in ("fps", "scale")
+        }
+        over = table["sigma"] == MEAN
+        sigma = [math.nan if text == MEAN else float(Fraction(text)) for text in table["sigma"]]
+        return table.assign(**numbers, sigma=sigma, over_sigmas=over)
 
     def __repr__(self) -> str:
         cells, failed = len(self.plan.cells), len(self.failures)
@@ -163,9 +183,19 @@ class StudyResults:
         notes += [
             note for scores in self.scores for about in scores.about for note in about["notes"]
         ]
+        notes += floor_notes(
+            row.trace + (f" x {row.scale}" if row.scale != 1 else "")
+            for row in self.summary
+            if row.sigma == 0 and row.staleness
+            if at_the_floor(row.skip_rate, row.staleness.mismatch_mean)
+        )
         for trace in self.traces:
             notes += [f"{trace['trace']}: {text}" for text in trace["warnings"]]
         return list(dict.fromkeys(notes))
+
+    def verdict(self) -> list[str]:
+        """What it comes to, in words (see :func:`lae_sim.study.verdict.verdict`)."""
+        return verdict(self.summary, self.required)
 
     def document(self) -> dict[str, Any]:
         """All but the scores of single sequences, as ``study.json`` holds it."""
@@ -174,6 +204,7 @@ class StudyResults:
             "version": "1.0",
             "lae_sim": __version__,
             "study": self.plan.study.document(),
+            "verdict": self.verdict(),
             "cells": len(self.plan.cells),
             "failures": flat_rows(self.failures),
             "notes": self.notes(),
@@ -222,14 +253,16 @@ def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathL
         LaeError: if it is, or if a folder stands where a file is to be, or a file for a folder.
     """
     written = [Path(folder, f"{name}.csv") for name in ("summary", "comparisons", "required")]
-    written += [Path(folder, "study.json"), Path(folder, "report.html")]
-    tables = Path(folder, "tables")
-    for path in (*written, *tables.glob("*.csv"), *tables.glob("*.tex")):
+    written += [Path(folder, name) for name in ("study.json", "report.html", "contents.json")]
+    folders = [Path(folder, name) for name in ("figures", "tables")]
+    inside = [path for each in folders for path in each.glob("*")]
+    for path in (*written, *(path for path in inside if path.suffix)):
         if path.exists() and not path.is_file():
             raise LaeError(f"{path}: is there already and is not a file: move it away")
-    if tables.exists() and not tables.is_dir():
-        raise LaeError(f"{tables}: is there already and is not a folder: move it away")
-    check_distinct([*written, *tables.glob("*")], inputs)
+    for each in folders:
+        if each.exists() and not each.is_dir():
+            raise LaeError(f"{each}: is there already and is not a folder: move it away")
+    check_distinct([*written, *inside], inputs)
 
 
 def _run(
@@ -241,7 +274,7 @@ def _run(
 ) -> StudyResults:
     study = plan.study
     store.prepare(plan.cells)
-    asked = [] if study.require_auc is None else searches(plan.cells, study.require_auc)
+    asked = searches(plan.cells, study.require_auc) if study.require_auc else []
     described = [Description(source.input, study.sequences) for source in plan.sources]
     cells = [cell for cell in plan.cells if not store.has(cell)]
     sought = [search for search in asked if store.document(search.key) is None]
@@ -286,7 +319,10 @@ def _run(
         summary=tuple(summarise_study(scores, study.seed)),
         comparisons=tuple(compare_traces(scores, study.seed)),
         required=tuple(
-            requirement(search, Slowest(**answer)) for search, answer in answers if answer
+            requirement(search, Curve(**answer), auc)
+            for search, answer in answers
+            if answer
+            for auc in search.required
         ),
         traces=tuple(filter(None, (store.document(each.key) for each in described))),
         computed=computed,

@@ -18,6 +18,7 @@ from lae_sim.engine.clock import exact, parse_duration, parse_fps, split_init, w
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
+from lae_sim.plugins import looking_in
 from lae_sim.replay.search import parse_search
 from lae_sim.replay.world import (
     check_sigmas,
@@ -72,7 +73,7 @@ class Study:
         seed: of random latencies, resamples and training.
         block: consecutive calls that the bootstrap of latencies keeps together.
         folds: of the training, where a forecaster is trained.
-        require_auc: AUC for which the needed speed is looked for; None = not looked for.
+        require_auc: one or several AUCs for which it is looked how slow trackers may be.
 
     Raises:
         LaeError: if a value is impossible; it names the key of the file.
@@ -105,7 +106,7 @@ class Study:
     seed: int = 0
     block: int = 30
     folds: int = 5
-    require_auc: Fraction | None = None
+    require_auc: tuple[Fraction, ...] = ()
     forget_arrivals: bool = False
 
     def __post_init__(self) -> None:
@@ -138,8 +139,9 @@ class Study:
             raise LaeError("keep_size: it is a way to use a pre_forecaster")
         if any(scale < 0 for scale in self.scales):
             raise LaeError("scales: times cannot be scaled by less than 0")
-        if self.require_auc is not None and not 0 < self.require_auc < 1:
-            raise LaeError(f"require_auc: an AUC is between 0 and 1, not {self.require_auc}")
+        for auc in self.require_auc:
+            if not 0 < auc < 1:
+                raise LaeError(f"require_auc: an AUC is between 0 and 1, not {auc}")
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Study:
@@ -175,7 +177,10 @@ class Study:
 
     def document(self) -> dict[str, Any]:
         """Plain values of everything, for provenance and digests."""
-        return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+        document = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+        if len(self.require_auc) < 2:  # one is a number, as in files of version 0.1
+            document["require_auc"] = next(iter(document["require_auc"]), None)
+        return document
 
 
 def is_random(latency: str) -> bool:
@@ -184,7 +189,7 @@ def is_random(latency: str) -> bool:
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
-    """Read a study from a TOML file; local traces are relative to its folder.
+    """Read a study from a TOML file; local traces, and modules of yours, are found in its folder.
 
     Args:
         path: of the file.
@@ -214,7 +219,8 @@ def read_study(path: str | os.PathLike[str]) -> Study:
             raise RecursionError
         # numbers stay as they are written: no float comes between
         document = tomllib.loads(content, parse_float=str)
-        return Study.of(document)
+        with looking_in(Path(path).parent):
+            return Study.of(document)
     except RecursionError as error:
         raise LaeError(f"{path}: is nested too deeply for a study") from error
     except (ValueError, LaeError) as error:  # ValueError also of a number of thousands of digits
@@ -310,6 +316,6 @@ _KEYS: Mapping[str, tuple[str, Callable[[Any], Any]]] = {
     "seed": ("seed", whole),
     "block": ("block", partial(whole, least=1)),
     "folds": ("folds", partial(whole, least=2)),
-    "require_auc": ("require_auc", exact),
+    "require_auc": ("require_auc", _several(exact)),
 }
 _PARSERS = {name: (key, parse) for key, (name, parse) in _KEYS.items()}

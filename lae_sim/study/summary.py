@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats
-from lae_sim.comparison.statistics import RESAMPLES, Bootstrap, Interval, holm
+from lae_sim.comparison.statistics import RESAMPLES, Bootstrap, Difference, Interval, holm
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED, Ranking, interval, summed
@@ -25,6 +25,7 @@ from lae_sim.study.cells import Cell, Setting
 from lae_sim.study.plan import Plan, Source
 from lae_sim.study.records import (
     MEAN,
+    Behind,
     Comparison,
     Modelled,
     Staleness,
@@ -206,23 +207,58 @@ def summarise_study(
 
     Returns:
         Rows in the order of the scores. Intervals and tests stand in the rows of the first sigma
-        and of the mean over sigma.
+        and of the mean over sigma; so does how far each trace with each forecaster is behind the
+        best of those with the same sequences.
     """
     bootstrap = Bootstrap(resamples, seed)
     hold = {each.identity: each for each in scores if each.forecaster == "hold"}
     rankings = rankings_of(scores)
     rows: list[SummaryRow] = []
     rivals: dict[tuple[Any, ...], list[int]] = {}
+    ranks: dict[tuple[Any, ...], list[tuple[int, Scores]]] = {}
     for each in scores:
         for row in _rows(each, hold.get(each.identity), bootstrap):
             row = replace(row, ranked_by=rankings[each.group].by)
             rival = (*each.group, each.sequences, each.forecaster, row.sigma)
             rivals.setdefault(rival, []).append(len(rows))
+            if row.certainty("auc") and row.score("auc") is not None:
+                rank = (*each.group, each.sequences, row.sigma)
+                ranks.setdefault(rank, []).append((len(rows), each))
             rows.append(row)
     for places in rivals.values():
         for place in _front([rows[place] for place in places]):
             rows[places[place]] = replace(rows[places[place]], pareto=True)
+    for some in ranks.values():
+        ranked_rows = [(rows[place], each) for place, each in some]
+        behind = _behind(ranked_rows, rankings[some[0][1].group], bootstrap)
+        for (place, _), found in zip(some, behind):
+            rows[place] = replace(rows[place], behind=found)
     return rows
+
+
+def _behind(
+    rivals: Sequence[tuple[SummaryRow, Scores]], ranking: Ranking, bootstrap: Bootstrap
+) -> list[Behind | None]:
+    """How far each of some rows is behind the best of them; None of that one.
+
+    The best is chosen by these very scores. Corrected for the others alone, the true best is still
+    among those not told apart from it, as often as the level says: Hsu, "Multiple Comparisons",
+    1996, Ch. 4.
+    """
+    best, of_best = max(rivals, key=lambda rival: rival[0].score("auc") or 0)
+    known: dict[int, Difference] = {}
+    for i, (row, scores) in enumerate(rivals):
+        if row is not best:
+            first, second = _paired(scores, of_best, ranking, row.sigma == MEAN)
+            if first.size:
+                differences = first.mean(axis=0) - second.mean(axis=0)
+                [margins] = bootstrap.means(differences[None])
+                known[i] = bootstrap.compare(differences, 0.0, margins, 0.0)
+    corrected = dict(zip(known, holm([difference.p for difference in known.values()])))
+    name = best.run, best.forecaster
+    return [
+        Behind(name, known[i], corrected[i]) if i in known else None for i in range(len(rivals))
+    ]
 
 
 def rankings_of(scores: Sequence[Scores]) -> dict[tuple[str, ...], Ranking]:
@@ -446,15 +482,9 @@ def _pair(a: Scores, b: Scores, ranking: Ranking, bootstrap: Bootstrap) -> Compa
     """A against B; None if they have no sequences in common that count."""
     setting = a.setting
     whole = set(SIGMA_GRID) == set(setting.world.sigmas)
-    both = sorted(set(a.sequences) & set(b.sequences))
-    first, second = (
-        ranked(one.by_repetition(whole), ranking)[:, [one.sequences.index(name) for name in both]]
-        for one in (a, b)
-    )
-    kept = ~np.isnan(first.mean(axis=0) + second.mean(axis=0))
-    if not kept.any():
+    first, second = _paired(a, b, ranking, whole)
+    if not first.size:
         return None
-    first, second = first[:, kept], second[:, kept]
     differences = first.mean(axis=0) - second.mean(axis=0)
     [margins] = bootstrap.means(differences[None])
     difference = bootstrap.compare(differences, 0.0, margins, 0.0)
@@ -481,6 +511,19 @@ def _pair(a: Scores, b: Scores, ranking: Ranking, bootstrap: Bootstrap) -> Compa
         better=_superiority(margins),
         ranked_by=ranking.by,
     )
+
+
+def _paired(a: Scores, b: Scores, ranking: Ranking, over_sigmas: bool) -> tuple[Floats, Floats]:
+    """The AUCs that count of the sequences that have one in both, float64 [R, S] each."""
+    both = sorted(set(a.sequences) & set(b.sequences))
+    first, second = (
+        ranked(one.by_repetition(over_sigmas), ranking)[
+            :, [one.sequences.index(name) for name in both]
+        ]
+        for one in (a, b)
+    )
+    kept = ~np.isnan(first.mean(axis=0) + second.mean(axis=0))
+    return first[:, kept], second[:, kept]
 
 
 def ranked(values: Mapping[str, Floats], ranking: Ranking) -> Floats:

@@ -10,7 +10,7 @@ from lae_sim._compiled import expect
 from lae_sim.errors import LaeError, explained
 from lae_sim.files import text_digest
 from lae_sim.study.cells import Cell, Input, Result, Setting, Task, compute
-from lae_sim.study.deployment import Search, slowest
+from lae_sim.study.deployment import Search, measured
 from lae_sim.study.records import Failure
 from lae_sim.trace.locate import digest, stamp
 
@@ -61,7 +61,7 @@ def _performed(work: Work) -> Any:
     if isinstance(work, Task):
         return _cell_by_cell(work)
     if isinstance(work, Search):
-        return asdict(slowest(work))
+        return asdict(measured(work))
     from lae_sim.trace.describe import describe
     from lae_sim.trace.file import read_trace
 
@@ -103,9 +103,8 @@ def work_in_words(work: Work) -> str:
         return work.trace.label
     if isinstance(work, Search):
         cell = work.cell
-        return (
-            f"AUC {float(work.required):g} of {cell.forecaster}: {_in_words(cell.setting, False)}"
-        )
+        asked = ", ".join(f"{float(auc):g}" for auc in work.required)
+        return f"AUC {asked} of {cell.forecaster}: {_in_words(cell.setting, False)}"
     return _in_words(_setting(work))
 
 

@@ -51,20 +51,6 @@ class EveryOther:
 
 policy = EveryOther()
 
-class Deadly:
-    def __init__(self, box, image_size=None):
-        import os
-        os.kill(os.getpid(), 9)
-
-class Confused:
-    def __init__(self, box, image_size=None):
-        raise ZeroDivisionError("of my own")
-
-def lazy(box, image_size=None, step=1):
-    return Stay(box)
-
-partial = functools.partial(lazy, step=2)
-
 class Stay:
     def __init__(self, box, image_size=None):
         self.box = box
@@ -72,6 +58,20 @@ class Stay:
         pass
     def predict(self, frame):
         return self.box
+
+class Deadly(Stay):
+    def __init__(self, box, image_size=None):
+        import os
+        os.kill(os.getpid(), 9)
+
+class Confused(Stay):
+    def __init__(self, box, image_size=None):
+        raise ZeroDivisionError("of my own")
+
+def lazy(box, image_size=None, step=1):
+    return Stay(box)
+
+partial = functools.partial(lazy, step=2)
 """
 
 
@@ -384,25 +384,28 @@ def test_the_tables_and_the_page_say_by_what_they_rank(tmp_path: Path) -> None:
     keys = {"latencies": [FAR["latencies"][0]], "search": ["c=0.3", "off"]}
     alone = ("--workers", 1)
     printed = study_here(toml(tmp_path, **keys), *alone, cwd=tmp_path)
-    assert "ranked by" in printed.splitlines()[1]
-    assert "modelled scores, and recorded" in printed.splitlines()[0]
+    caption, header, *_ = printed.partition("\n\n")[2].splitlines()  # after the verdict
+    assert "ranked by" in header
+    assert "modelled scores, and recorded" in caption
     assert "not computed" not in printed
     assert "the reach is given or measured" in " ".join(printed.split())
     one = study_here(toml(tmp_path, **{**keys, "search": "c=0.3"}), *alone, cwd=tmp_path)
-    assert one.splitlines()[0].endswith("sigma 0, modelled scores")
+    assert "best: modelled AUC" in one.partition("\n\n")[0]
+    caption = one.partition("\n\n")[2].splitlines()[0]
+    assert caption.endswith("sigma 0, modelled scores")
     assert "Trackers against each other, by the modelled AUC" in one
     page = (tmp_path / "study-results" / "report.html").read_text()
     assert "synthetic-slow: modelled: c = 0.3, as given" in page
     assert "ranked by the modelled scores: the reach is given or measured" in page
     assert ", of the recorded boxes" in page  # the curves
     ranking = pd.read_csv(tmp_path / "study-results" / "tables" / "ranking.csv")
-    assert ranking["modelled"].is_monotonic_decreasing
-    assert (ranking["modelled low"] < ranking["modelled"]).all()
+    assert ranking["modelled_auc"].is_monotonic_decreasing
+    assert (ranking["modelled_auc_low"] < ranking["modelled_auc"]).all()
     summary = pd.read_csv(tmp_path / "study-results" / "summary.csv")
     best = summary.sort_values("modelled_auc", ascending=False)
-    np.testing.assert_array_equal(ranking["modelled"], best["modelled_auc"])
+    np.testing.assert_array_equal(ranking["modelled_auc"], best["modelled_auc"])
     np.testing.assert_array_equal(
-        ranking["vs hold"].fillna(0), best["vs_hold_modelled_auc"].fillna(0)
+        ranking["vs_hold_auc"].fillna(0), best["vs_hold_modelled_auc"].fillna(0)
     )
     off = study_here(toml(tmp_path, **{**keys, "search": "off"}), *alone, cwd=tmp_path)
     assert "model" not in off
@@ -531,6 +534,8 @@ def test_what_the_means_rest_on_is_said(tmp_path: Path) -> None:
     assert "synthetic: its traces do not have the same sequences: compare no means" in notes
     assert "few: times: synthetic (made up, not measured)" in notes
     assert "answers come later by what forecasting costs: kalman 2000 us" in notes
+    floor = "a floor of one frame for synthetic-fast, though almost no frame is skipped: "
+    assert [note.startswith(floor) for note in notes if "floor" in note] == [True]
 
 
 # ------------------------------------------------------------------------------ resuming
@@ -890,7 +895,16 @@ def test_a_cell_of_other_columns_says_what_to_do(finished: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    "name", ["summary.csv", "study.json", "report.html", "tables/ranking.tex", "tables"]
+    "name",
+    [
+        "summary.csv",
+        "study.json",
+        "report.html",
+        "tables/ranking.tex",
+        "tables",
+        "figures",
+        "contents.json",
+    ],
 )
 def test_what_could_not_be_written_is_said_before_the_work(name: str, tmp_path: Path) -> None:
     run(tmp_path / "study")  # so that it is the folder of a study
@@ -899,7 +913,7 @@ def test_what_could_not_be_written_is_said_before_the_work(name: str, tmp_path: 
     place = tmp_path / "study" / name
     place.unlink(missing_ok=True)
     place.parent.mkdir(exist_ok=True)
-    if name == "tables":
+    if name in ("tables", "figures"):
         place.write_text("mine")
     else:
         place.mkdir()

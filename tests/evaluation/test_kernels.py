@@ -138,7 +138,8 @@ def test_kernels_are_what_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(5)
     some = [replay_sequence(recording("a", random, False), CLOCK)]
     used = []
-    for name in ("sum_gaps", "changes", "used_outputs", "list_pairs", "count_pairs"):
+    names = ("sum_gaps", "changes", "used_outputs", "most_pairs", "list_pairs", "count_pairs")
+    for name in names:
         kernel = getattr(kernels, name)
 
         def noted(*arguments: Any, name: str = name, kernel: Any = kernel) -> Any:
@@ -146,7 +147,7 @@ def test_kernels_are_what_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
             return kernel(*arguments)
 
         monkeypatch.setattr(kernels, name, noted)
-    for way, expected in (("0", 0), ("1", 5)):
+    for way, expected in (("0", 0), ("1", len(names))):
         with switched(way):
             evaluate_runs(some, Metadata.new("30", "every-frame"), {"kalman": Kalman}, SIGMA_GRID)
         assert len(set(used)) == expected

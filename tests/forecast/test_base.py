@@ -50,6 +50,19 @@ def test_simple_forecasters_by_hand(factory: Any, expected: list[list[float]]) -
     assert forecast(lambda *both: factory(*both), TWO, ITEM, FRAME).tolist() == expected
 
 
+def test_items_in_step() -> None:
+    """The lanes of the docstring, the longest of them last."""
+    lengths = np.array([3, 1, 4])
+    offsets = np.concatenate([[0], np.cumsum(lengths)])
+    lanes = Lanes(offsets, np.arange(8), np.zeros((8, 4)), np.full((3, 2), np.inf))
+    order, running = lanes.in_step()
+    assert order.tolist() == [4, 0, 3, 5, 1, 6, 2, 7]
+    assert running.tolist() == [3, 2, 2, 1]
+    assert lanes.firsts().tolist() == lanes.first(np.arange(8)).tolist() == [0] * 3 + [3] + [4] * 4
+    none = Lanes(np.array([0]), np.arange(0), np.zeros((0, 4)), np.zeros((0, 2)))
+    assert [len(each) for each in none.in_step()] == [0, 0]
+
+
 def test_a_custom_forecaster_is_fed_in_order_and_asked_as_of_each_item() -> None:
     log: list[Any] = []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import subprocess
 import sys
 from dataclasses import replace
 from fractions import Fraction
@@ -28,7 +29,9 @@ from lae_sim.forecast.learned import (
     OUTPUTS,
     SHIPPED,
     Learned,
+    Past,
     read_learned,
+    rows_of,
     shipped,
     write_learned,
 )
@@ -219,6 +222,55 @@ def test_answers_are_the_same_bits_for_any_number_of_lanes(
         if k == 0:
             streamed = streaming(LEARNED, one, alone, one.frames + 3)
             assert streamed.tobytes() == found[k].tobytes()
+
+
+WANDERING = """
+import numpy as np
+from lae_sim.forecast.base import Lanes, forecast
+from lae_sim.forecast.learned import shipped
+
+rng, length = np.random.default_rng(6), 30
+boxes = np.cumsum(rng.normal(0, 3, (40, length, 4)), axis=1) + [300, 200, 60, 40]
+frames, item = np.tile(np.arange(length) * 2, 40), np.arange(40 * length)
+lanes = Lanes(np.arange(41) * length, frames, boxes.reshape(-1, 4), np.full((40, 2), np.inf))
+print(forecast(shipped(), lanes, item, frames + 3).tobytes().hex())
+"""
+
+
+def computed_with(kernel: str, threads: int) -> str:
+    """Forecasts by a process whose BLAS has a processor's kernel and so many threads."""
+    settings = {"OPENBLAS_CORETYPE": kernel, "OPENBLAS_NUM_THREADS": str(threads)}
+    command = [sys.executable, "-c", WANDERING]
+    return subprocess.check_output(command, env={**os.environ, **settings}, text=True)
+
+
+def test_answers_are_the_same_bits_on_other_processors() -> None:
+    """OpenBLAS has kernels for each, which add up in other orders: floats in general differ."""
+    found = computed_with("Nehalem", threads=1)
+    assert len(found) > 1000
+    assert found == computed_with("Haswell", threads=3)
+
+
+class Kept:
+    """Stands for a network, and keeps what it is shown."""
+
+    def __call__(self, inputs: np.ndarray) -> np.ndarray:
+        self.inputs = inputs.copy()
+        return np.zeros((OUTPUTS, inputs.shape[1]))
+
+
+@given(case=CASES)
+@settings(max_examples=30)
+def test_what_is_seen_in_training_is_what_is_seen_in_forecasts(case: Any) -> None:
+    """Windows are gathered for the one, and slices for the other."""
+    lanes, item, frame = case
+    network: Any = Kept()
+    forecast(Learned(network), lanes, item, frame)
+    past = Past.of(lanes)
+    window = past.window(np.arange(len(lanes.frames)))
+    expected = rows_of(past.velocity, past.interval)[:, window.T].swapaxes(0, 1)
+    seen = network.inputs[:-3].reshape(expected.shape)
+    np.testing.assert_array_equal(seen[:, 2:], expected[:, 2:])  # all but x and y, mirrored here
 
 
 # -------------------------------------------------------------------------------------- symmetries

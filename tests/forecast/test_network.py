@@ -23,6 +23,7 @@ from places import TRACES
 
 from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError
+from lae_sim.forecast.learned import SHIPPED, read_learned
 from lae_sim.forecast.network import ONE, Network, read_network, write_network
 
 WIDTHS = [9, 7, 5]
@@ -48,10 +49,10 @@ def test_answers_are_those_of_whole_numbers(seed: int, rows: int, most: int) -> 
     network = random_network([9, 20, 6, 4], seed)
     inputs = np.random.default_rng(seed).integers(-most, most + 1, (rows, 9))
     expected = [integers(network, row) for row in inputs.tolist()]
-    given = inputs.astype(np.float64)
-    assert network(given).tolist() == expected
-    assert given.tolist() == inputs.tolist()  # which are not written over
-    assert [network(row).tolist() for row in given] == expected  # a row alone
+    given = inputs.T.astype(np.float64)
+    assert network(given).T.tolist() == expected
+    assert given.T.tolist() == inputs.tolist()  # which are not written over
+    assert [network(column).tolist() for column in given.T] == expected  # one alone
 
 
 def test_the_largest_numbers_are_exact_too() -> None:
@@ -66,16 +67,39 @@ def test_the_largest_numbers_are_exact_too() -> None:
     assert network(np.array(row, float)).tolist() == integers(network, row) == [257]
 
 
-@given(seed=st.integers(0, 2**32), count=st.integers(1, 300), cut=st.integers(0, 300))
+@given(seed=st.integers(0, 2**32), count=st.integers(1, 500), cut=st.integers(0, 500))
 @settings(max_examples=30)
-def test_rows_are_answered_alike_in_any_company(seed: int, count: int, cut: int) -> None:
+def test_columns_are_answered_alike_in_any_company(seed: int, count: int, cut: int) -> None:
     network = random_network([69, 64, 64, 64], seed % 5)
-    rows = np.random.default_rng(seed).integers(-4096, 4097, (count, 69)).astype(np.float64)
-    whole = network(rows)
-    parts = [network(part) for part in (rows[:cut], rows[cut:])]
-    assert np.concatenate(parts).tobytes() == whole.tobytes()
-    assert network(rows[::-1])[::-1].tobytes() == whole.tobytes()
-    assert network(np.asfortranarray(rows)).tobytes() == whole.tobytes()
+    columns = np.random.default_rng(seed).integers(-4096, 4097, (69, count)).astype(np.float64)
+    whole = network(columns)
+    parts = [network(part) for part in (columns[:, :cut], columns[:, cut:])]
+    assert np.concatenate(parts, axis=1).tobytes() == whole.tobytes()
+    assert network(columns[:, ::-1])[:, ::-1].tobytes() == whole.tobytes()
+    assert network(np.asfortranarray(columns)).tobytes() == whole.tobytes()
+    assert network(columns[:, 0]).tobytes() == whole[:, 0].tobytes()
+
+
+@given(seed=st.integers(0, 2**32))
+@settings(max_examples=30)
+def test_sums_are_the_same_bits_in_any_order(seed: int) -> None:
+    """Inputs and hidden units are added up in another order: floats in general differ then."""
+    rng = np.random.default_rng(seed)
+    network = read_learned(SHIPPED).network
+    inputs = rng.integers(-50_000, 50_001, (network.inputs, 40)).astype(np.float64)
+    orders = [rng.permutation(len(weight)) for weight in network.weights]
+    last = np.arange(network.outputs)
+    shuffled = Network(
+        tuple(
+            w[order][:, to] for w, order, to in zip(network.weights, orders, [*orders[1:], last])
+        ),
+        tuple(bias[to] for bias, to in zip(network.biases, [*orders[1:], last])),
+        {},
+    )
+    assert shuffled(inputs[orders[0]]).tobytes() == network(inputs).tobytes()
+    real = inputs / 3
+    sums = [np.add.accumulate(each, axis=0)[-1] for each in (real, real[orders[0]])]
+    assert sums[0].tobytes() != sums[1].tobytes()
 
 
 def test_real_weights_are_rounded_to_the_nearest_and_bounded() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,11 @@ def test_numbers_are_exact_as_they_are_written(tmp_path: Path) -> None:
     assert study.fps == (None, Fraction(2997, 100), Fraction(30000, 1001), 60)
     assert study.scales == (Fraction(1, 10), Fraction(1, 3), 2)
     assert study.sigmas == (0, Fraction(1, 50), 1)
-    assert study.require_auc == Fraction(11, 20)
+    assert study.require_auc == (Fraction(11, 20),)
+    assert study.document()["require_auc"] == "11/20"
+    several = dataclasses.replace(study, require_auc=["0.5", 0.6])
+    assert several.require_auc == (Fraction(1, 2), Fraction(3, 5))
+    assert several.document()["require_auc"] == ["1/2", "3/5"]
 
 
 def test_the_grid_of_sigmas_has_a_name() -> None:

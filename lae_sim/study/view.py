@@ -18,6 +18,7 @@ from lae_sim.errors import LaeError, shown, visible
 from lae_sim.evaluation.modelled import Ranking
 from lae_sim.study.records import MEAN, Comparison, Requirement, SummaryRow
 from lae_sim.study.summary import Scores, ranked, rankings_of
+from lae_sim.study.verdict import names_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -31,7 +32,7 @@ SETTINGS = ("policy", "fps", "latency", "scale", "search", "pre_forecaster", "co
 
 def run_of(row: SummaryRow | Requirement) -> str:
     """The trace of a row, and where its times come from, if from another."""
-    return row.trace if row.times_from == row.trace else f"{row.trace} at {row.times_from}"
+    return row.run
 
 
 def setting_of(row: SummaryRow | Comparison) -> tuple[str | Fraction, ...]:
@@ -109,11 +110,8 @@ class View:
 
     @cached_property
     def names(self) -> dict[str, str]:
-        """Names of the runs: their trackers, where these tell the runs of each dataset apart."""
-        runs = {run_of(row): (row.dataset, row.tracker) for row in self.rows}
-        alone = len({*runs.values()}) == len(runs)
-        alone &= all(tracker != "unknown" for _, tracker in runs.values())
-        return {run: visible(tracker if alone else run) for run, (_, tracker) in runs.items()}
+        """Names of the runs (see :func:`lae_sim.study.verdict.names_of`)."""
+        return names_of(self.rows)
 
     @cached_property
     def forecasters(self) -> tuple[str, ...]:
