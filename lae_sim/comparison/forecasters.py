@@ -73,8 +73,8 @@ def score_forecasters(
         ``attrs["ranking"]`` is the :class:`.modelled.Ranking`, as plain values.
 
     Raises:
-        LaeError: if there is no trace, nothing can be scored, the worlds differ in what they share, or whatever replaying,
-            training and scoring raise.
+        LaeError: if there is no trace, nothing can be scored, the worlds differ in what they share,
+            or whatever replaying, training and scoring raise.
     """
     if not traces:
         raise LaeError("there is nothing to compare: name at least one trace")
