@@ -118,7 +118,8 @@ def _curve_groups(view: View) -> list[tuple[list[Scores], str]]:
     """Scores whose curves are drawn together, and what was left out; what stands for all first."""
     groups: dict[tuple[Any, ...], list[Scores]] = {}
     for scores in view.results.scores:
-        groups.setdefault(scores.group, []).append(scores)
+        if scores.about[0]["curves"]["success"] is not None:  # something was scored
+            groups.setdefault(scores.group, []).append(scores)
     ordered = sorted(
         groups.values(), key=lambda group: not any(view.stands(view.row_of(s)) for s in group)
     )
