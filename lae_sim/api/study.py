@@ -11,7 +11,8 @@ from typing import Any
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
 from lae_sim.figures.study import study_in_columns
-from lae_sim.progress import ProgressBar
+from lae_sim.plugins import looking_in
+from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
 from lae_sim.report.paper import Paper, remove_paper, write_paper
@@ -28,7 +29,7 @@ def run_study(
     workers: int | None = None,
     scheduler: str | None = None,
     report: bool = True,
-    progress: bool | None = None,
+    progress: ShowProgress = None,
     **keys: Any,
 ) -> StudyResults:
     """Replay and score many traces in many worlds, or go on where an earlier run stopped.
@@ -41,7 +42,8 @@ def run_study(
         workers: processes on this machine; by default one for each core. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead.
         report: whether to write ``report.html``, ``figures/`` and ``tables/`` too.
-        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        progress: whether to show a progress bar, by default on a terminal and in a notebook; or a
+            function, which is told: ``progress(done, total, what)``.
         keys: keys of the study file (see :class:`Study`).
 
     In a script, call it under ``if __name__ == "__main__":``, since workers import the script.
@@ -67,7 +69,7 @@ def run_study(
         if scheduler is not None:
             raise LaeError("workers: for this machine: a scheduler says where to compute instead")
     made, base, kept = _asked_for(study, keys, folder)
-    with ProgressBar("study", "tasks", progress) as bar:
+    with ProgressBar("study", "tasks", progress) as bar, looking_in(base or "."):
 
         def advance(what: str, done: int, total: int) -> None:
             bar(done, total, what)

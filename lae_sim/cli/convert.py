@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser, print_json
-from lae_sim.errors import LaeError, listed
+from lae_sim.errors import LaeError, install, listed
 from lae_sim.files import check_distinct, check_places
 from lae_sim.progress import ProgressBar, print_text
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary
 
 _FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "json", "npz", "lae-pvt")
-_EXAMPLES = """\
+_EXAMPLES = f"""\
 formats (auto tells them apart):
   got10k       <seq>.txt with <seq>_time.txt or times/<seq>_time.txt (s);
                <seq>/<seq>_001.txt with <seq>/<seq>_time.txt
@@ -29,7 +29,8 @@ formats (auto tells them apart):
   npz          one file, an array [frames, 4] per sequence: needs --time
   lae-pvt      <seq>.pkl of LAE-PVT and PVT++, recorded in real time
 Names may be <dataset>_<seq> (nfs_, uav_, ...), <seq>_<tracker> and <tracker>_<seq> in any format;
-of several trackers in a folder --tracker chooses one. A .mat of version 7.3 needs lae-sim[mat73].
+of several trackers in a folder --tracker chooses one. A .mat of version 7.3 needs h5py
+({install("mat73")}).
 
 examples:
   lae-sim convert results/kcf --truth OTB100 --out kcf.parquet

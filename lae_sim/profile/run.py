@@ -57,7 +57,7 @@ from lae_sim.profile.passes import (
 from lae_sim.profile.timed import TimedTracker
 from lae_sim.profile.translation import Translated
 from lae_sim.profile.worker import InProcess, Worker
-from lae_sim.progress import ProgressBar, tell
+from lae_sim.progress import ProgressBar, ShowProgress, tell
 from lae_sim.replay.latency import time_label
 from lae_sim.replay.strides import phases
 from lae_sim.replay.world import flag, named, parse_policy, several, text
@@ -224,7 +224,7 @@ def profile_tracker(
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
     force: bool = False,
-    progress: bool | None = None,
+    progress: ShowProgress = None,
     **settings: Any,
 ) -> Profile:
     """Run a tracker on this device and write a trace of each pass.
@@ -240,7 +240,8 @@ def profile_tracker(
         force: whether to replace what is there already, be it a trace of another tracker or
             dataset, or no trace.
         progress: whether to show a progress bar, and what a user should know besides; by default
-            on a terminal and in a notebook.
+            on a terminal and in a notebook; or a function, which is told:
+            ``progress(done, total, what)``.
         settings: attributes of :class:`ProfilePlan`, as :meth:`ProfilePlan.of` takes them.
 
     Raises:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
 from lae_sim.errors import LaeError
+from lae_sim.evaluation.caveats import at_the_floor, floor_notes
 from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
@@ -180,6 +181,12 @@ class StudyResults:
         notes += [
             note for scores in self.scores for about in scores.about for note in about["notes"]
         ]
+        notes += floor_notes(
+            row.trace + (f" x {row.scale}" if row.scale != 1 else "")
+            for row in self.summary
+            if row.sigma == 0 and row.staleness
+            if at_the_floor(row.skip_rate, row.staleness.mismatch_mean)
+        )
         for trace in self.traces:
             notes += [f"{trace['trace']}: {text}" for text in trace["warnings"]]
         return list(dict.fromkeys(notes))

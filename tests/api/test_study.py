@@ -107,3 +107,8 @@ def test_a_progress_bar(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     out, err = capsys.readouterr()
     assert out == ""
     assert "100%" in err
+    told = []
+    lae_sim.run_study(**keys, folder=tmp_path / "c", progress=lambda *each: told.append(each))
+    done, total, what = told[-1]
+    assert (done, what) == (total, "summing up")
+    assert [each[:2] for each in told[:-1]] == [(k, total) for k in range(1, total + 1)]

@@ -61,7 +61,7 @@ SETTINGS: list[tuple[dict[str, Any], str]] = [
     ({"forecasters": 3}, "forecasters: 3 is neither a name nor makes forecasters"),
     ({"forecasters": {"mine": 3}}, "forecasters: 3 is neither"),
     ({"forecasters": {3: lae_sim.Hold}}, "forecasters: the name of a forecaster is text, not 3"),
-    ({"forecasters": int}, "forecasters: the class int has no update and no predict"),
+    ({"forecasters": int}, r"forecasters: int has no method update\(frame, box\)"),
     ({"forecasters": {"hold": lae_sim.Kalman}}, "forecasters: 'hold' is the baseline"),
     (
         {"forecasters": [lambda box, size: lae_sim.Hold(box), lambda box, size: None]},
