@@ -7,6 +7,8 @@ several rounds are compared. The input has the size of UAV123: 123 sequences, 11
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import os
 import statistics
 import subprocess
 import sys
@@ -20,10 +22,13 @@ import numpy as np
 import simpy
 from filterpy.kalman import KalmanFilter
 
-from lae_sim import Metadata, Recording, Trace, simulate, write_trace
+from lae_sim import Metadata, Recording, Trace, replay_trace, simulate, write_trace
+from lae_sim._compiled import SWITCH
 from lae_sim.engine import Clock, latest
-from lae_sim.forecast.base import ForecasterFactory, Lanes, defines, forecast
+from lae_sim.evaluation import evaluate_groups
+from lae_sim.forecast.base import ForecasterFactory, Hold, Lanes, defines, forecast
 from lae_sim.learning.registry import load_forecaster
+from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.table import aligned
 
 SEQUENCES, FRAMES = 123, 112_578
@@ -231,6 +236,78 @@ def forecaster_lines(rounds: int) -> list[list[str]]:
     return rows
 
 
+def switched(way: str, work: Callable[[], object]) -> Callable[[], object]:
+    """The same work, without compiled kernels ("0") or with them ("1")."""
+
+    def done() -> None:
+        before = os.environ.get(SWITCH)
+        os.environ[SWITCH] = way
+        try:
+            work()
+        finally:
+            os.environ.pop(SWITCH)
+            if before is not None:
+                os.environ[SWITCH] = before
+
+    return done
+
+
+def has_kernels() -> bool:
+    """Whether numba is installed, and not switched off."""
+    return importlib.util.find_spec("numba") is not None and os.environ.get(SWITCH) != "0"
+
+
+def kernel_lines(trace: str, rounds: int) -> list[list[str]]:
+    """Compiled kernels beside NumPy's lines, in one process that has them compiled.
+
+    They load numba, which other lines must not: these are the last of their process.
+    """
+    if not has_kernels():
+        return [["compiled kernels", "numba is not installed: the extra fast", "", "", ""]]
+    rng = np.random.default_rng(3)
+    many, count = 1000, 900
+    offsets = np.arange(many + 1) * count
+    frames = np.tile(np.arange(count) * 2, many)
+    lanes = Lanes(
+        offsets, frames, rng.normal(100, 5, (many * count, 4)), np.full((many, 2), np.inf)
+    )
+    asked = np.arange(len(frames))
+    runs = list(replay_trace(trace, search="off"))
+    metadata = Metadata.new("30", "every-frame")
+    kalman = load_forecaster("kalman")
+
+    def scored(**factories: ForecasterFactory) -> None:
+        for _ in evaluate_groups(runs, metadata, factories, SIGMA_GRID):
+            pass
+
+    works: dict[str, tuple[Callable[[], object], float, str, str]] = {
+        f"kalman, {many:,} lanes": (
+            lambda: forecast(kalman, lanes, asked, frames + 3),
+            len(asked),
+            "us per update and prediction",
+            "<= 0.02 us",
+        ),
+        "51 sigmas, hold": (lambda: scored(hold=Hold), FRAMES, "us per world frame", ""),
+        "51 sigmas, hold + kalman": (
+            lambda: scored(hold=Hold, kalman=kalman),
+            FRAMES,
+            "us per world frame",
+            "",
+        ),
+    }
+    rows = []
+    for name, (work, size, unit, target) in works.items():
+        switched("1", work)()  # compiles
+        ways = {"NumPy": switched("0", work), "compiled": switched("1", work)}
+        taken = medians(ways, rounds)
+        rows += [
+            [f"compiled kernels: {name}", way, f"{each / size * 1e6:.4f} {unit}"]
+            + [f"{each / taken['NumPy']:.3f}", target if way == "compiled" else ""]
+            for way, each in taken.items()
+        ]
+    return rows
+
+
 def lines(
     what: str,
     found: dict[str, float],
@@ -348,6 +425,7 @@ def main() -> None:
         found += process_lines(str(trace), arguments.rounds)
         found += search_lines(str(trace), folder, arguments.rounds)
         found += memory_lines(folder, arguments.sequences)
+        found += kernel_lines(str(trace), arguments.rounds)
     print(aligned(["what", "how", "median", "ratio", "target"], found))
 
 

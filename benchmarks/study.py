@@ -22,9 +22,10 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from run import CLOCK, FRAMES, lengths, medians, recordings
+from run import CLOCK, FRAMES, has_kernels, lengths, medians, recordings, switched
 
 from lae_sim import Metadata, Recording, Trace, replay_trace, simulate, write_trace
+from lae_sim._compiled import SWITCH
 from lae_sim.engine import Times, latest, simulate_lanes
 from lae_sim.evaluation import evaluate_groups
 from lae_sim.forecast import Hold
@@ -51,11 +52,12 @@ class Cost:
     worker: float
 
 
-def process(*arguments: str) -> Cost:
+def process(*arguments: str, **environment: str) -> Cost:
     """Run Python to its end (memory: Linux)."""
     start = time.perf_counter()
     command = [sys.executable, *arguments]
-    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    nothing = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    running = subprocess.Popen(command, env={**os.environ, **environment}, **nothing)
     peaks: dict[int, float] = {}
     while not (ended := os.wait4(running.pid, os.WNOHANG))[0]:
         for pid in (running.pid, *_children(running.pid)):
@@ -112,7 +114,11 @@ def write_tracker(path: Path, rate: int, jitter: float, times: int = 1) -> str:
 
 
 def study(
-    folder: Path, traces: Sequence[str], forecasters: Sequence[str], *options: str
+    folder: Path,
+    traces: Sequence[str],
+    forecasters: Sequence[str],
+    *options: str,
+    **environment: str,
 ) -> Callable[[], Cost]:
     """A whole study of traces over the grid of permitted latencies, from nothing."""
     number = count()
@@ -123,9 +129,8 @@ def study(
     def work() -> Cost:
         with tempfile.TemporaryDirectory(dir=folder) as out:
             where = str(Path(out) / str(next(number)))
-            return process(
-                "-m", "lae_sim", "study", str(file), "--no-report", "--out", where, *options
-            )
+            command = ("-m", "lae_sim", "study", str(file), "--no-report", "--out", where)
+            return process(*command, *options, **environment)
 
     return work
 
@@ -143,6 +148,11 @@ def whole_lines(folder: Path, rounds: int) -> list[list[str]]:
             "hold": study(folder, traces, ["hold"]),
             "hold + kalman": study(folder, traces, ["hold", "kalman"]),
         }
+        if has_kernels():
+            works["hold + kalman"]()  # compiles
+            works["the same, no compiled kernels"] = study(
+                folder, traces, ["hold", "kalman"], **{SWITCH: "0"}
+            )
         taken = in_turn(works, rounds)
         floor = taken["read the Parquet files"].wall
         found += [
@@ -222,22 +232,31 @@ def lane_lines(rounds: int) -> list[list[str]]:
         for _ in make():
             pass
 
-    works = {
+    plain = {
         "SimPy, schedule alone": simpy,
         "schedule alone": lambda: exhaust(lambda: simulate_lanes(sizes, CLOCK, every, latest)),
         "and bootstrap's draws, boxes": lambda: exhaust(runs),
         "and scores, hold": lambda: scored(drawn),
         "and the search model, c = 0.7": lambda: scored(modelled),
     }
+    works = {name: switched("0", work) for name, work in plain.items()}
+    if has_kernels():
+        for name in [*works][1:4]:
+            works[f"{name}, compiled"] = switched("1", plain[name])
+            works[f"{name}, compiled"]()
     taken = medians(works, rounds)
     speed = {
         name: FRAMES * (1 if "SimPy" in name else REPETITIONS) / seconds / 1e6
         for name, seconds in taken.items()
     }
+    targets = {
+        "schedule alone": ">= 30",
+        "schedule alone, compiled": ">= 150 M frames/s",
+        "and scores, hold, compiled": ">= 20 M frames/s",
+    }
     return [
         [f"random latencies, {len(every):,} lanes", name, f"{rate:.2f} M frames/s", "", ""]
-        + [f"{rate / speed['SimPy, schedule alone']:.1f} x SimPy"]
-        + [">= 30" if name == "schedule alone" else ""]
+        + [f"{rate / speed['SimPy, schedule alone']:.1f} x SimPy", targets.get(name, "")]
         for name, rate in speed.items()
     ]
 

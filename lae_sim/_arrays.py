@@ -16,5 +16,9 @@ Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 
 
+Frames = npt.NDArray[np.int32]
+"""Frame numbers where there are very many of them."""
+
+
 Count = TypeVar("Count", int, Ints)
 """Frames or ticks: a number, or int64 [n]."""

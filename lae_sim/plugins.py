@@ -91,9 +91,13 @@ def imported(what: str, name: str) -> tuple[Any, dict[str, Any]]:
         for part in attribute.split("."):
             made = getattr(made, part)
     except Exception as error:  # a user's module may fail in any way while it is imported
-        raise LaeError(f"{what}: {type(error).__name__}: {error}") from error
+        said = f"{what}: {type(error).__name__}: {error}"
+        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
+            suffixed = module.endswith(".py")
+            said += "; leave out .py" if suffixed else f"; the current folder is {os.getcwd()}"
+        raise LaeError(said) from error
     if not callable(made):
-        raise LaeError(f"{what} is not callable")
+        raise LaeError(f"{what} is not callable: name a class or a function")
     try:
         return made, parse_options(dict(map(key_and_value, options.split(",") if colon else ())))
     except LaeError as error:

@@ -184,6 +184,16 @@ def test_what_a_function_makes_is_looked_at_when_it_is_made():
         lae_sim.evaluate(SLOW, forecasters=imported("it", "mine:Forgetful")[0])
 
 
+def test_a_module_that_is_not_there_is_told_from_what_it_imports(tmp_path):
+    (tmp_path / "needy_module.py").write_text("import nowhere_module\n")
+    with pytest.raises(LaeError, match="No module named 'neady'; the current folder is /"):
+        imported("it", "neady:Thing")
+    with pytest.raises(LaeError, match=r"No module named 'mine\.py'.*; leave out \.py"):
+        imported("it", "mine.py:Damped")
+    with pytest.raises(LaeError, match=r"No module named 'nowhere_module'$"):
+        imported("it", "needy_module:Thing")
+
+
 def test_wrong_policies_latencies_and_trackers_are_named():
     with pytest.raises(LaeError, match=r"timeless\(\) .* called as timeless\(clock, calls\)"):
         parse_policy("mine:timeless")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lae_sim._compiled import amount, expect
 from lae_sim.api.inputs import (
     Costs,
     Forecasters,
@@ -30,7 +31,7 @@ from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError, hint, listed, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
-from lae_sim.evaluation.metrics import METRICS, find_convention
+from lae_sim.evaluation.metrics import METRICS, UNSCORED, find_convention
 from lae_sim.evaluation.modelled import FIGURES
 from lae_sim.evaluation.totals import Totals, search_report
 from lae_sim.files import sequence_names
@@ -106,6 +107,7 @@ class Scenario:
                 progress(len(run))
 
         names = list(self.forecasters)
+        expect(amount(self.trace.frames or 0, len(self.world.sigmas)) * len(names))
         totals, rows = Totals(names.index("hold")), SequenceRows(names)
         for part in evaluate_groups(
             runs(),
@@ -580,9 +582,14 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
         parts: of one or several traces, in one world or several.
         sigma: the permitted latency of a sweep's scores; the first by default. Success and
             precision are at the first in any case.
+
+    Raises:
+        LaeError: if no sequence is scored.
     """
     from lae_sim.figures.replay import success_and_precision, sweep_figure
 
+    if not any(part.totals.replay.scored.any() for part in parts):
+        raise LaeError(f"nothing to draw: {UNSCORED}")
     plotted = _Plotted.of(parts, sigma)
     if plotted.swept:
         reports = [part.document() for part in parts]

@@ -100,7 +100,8 @@ def _asked_for(
         return Study.of(keys if study is None else study), None, kept
     if not isinstance(study, (str, os.PathLike)) or str(study).endswith(".parquet"):
         raise LaeError(
-            f"study: {shown(study)} is no TOML file and no Study; name traces by traces=..."
+            f"study: {shown(study)} is no TOML file and no Study; name traces by traces=... (in a "
+            'TOML file: traces = ["a.parquet", "b.parquet"])'
         )
     path = Path(study)
     kept = folder or f"{path.stem}-results"

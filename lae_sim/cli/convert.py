@@ -63,8 +63,8 @@ def parser() -> argparse.ArgumentParser:
         "--time",
         default="measured",
         help="measured (default), constant:47ms, mean-fps:120, or mean-fps:FILE.csv with columns "
-        "sequence, fps and perhaps tracker, frames; ,init=800ms at the end of one that is not "
-        "measured says what the initialisation takes (default: as a frame)",
+        "sequence, fps and perhaps tracker, frames, or tracker, fps; ,init=800ms at the end of one "
+        "that is not measured says what the initialisation takes (default: as a frame)",
     )
     add(
         "--time-unit",

@@ -9,20 +9,22 @@ and whatever ends in an error.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import cast
 
 import numpy as np
 
 from lae_sim._arrays import Ints
+from lae_sim._compiled import compiled
 from lae_sim.engine.clock import MAX_INT64, Clock
-from lae_sim.engine.policies import LanePolicy
+from lae_sim.engine.policies import CompiledPolicy, LanePolicy
 from lae_sim.engine.scheduler import Policy, Schedule, Service, scores_latency, simulate
 from lae_sim.engine.times import Times
 
 _CELLS = 1 << 20  # lanes x frames in memory at once, a few arrays of them
 _STEPS = 32  # calls from one sorting-out of the lanes that have ended to the next
 _FEWEST = 8  # lanes that are faster together than one by one
+_FEWEST_TICKS = 2**12  # of an interval, so that no frame in 64-bit ticks has more than 51 bits
 
 
 def batchable(services: Sequence[Service], policy: Policy) -> bool:
@@ -54,16 +56,79 @@ def simulate_lanes(
         LaeError: what ``simulate`` raises, when that sequence's turn comes.
     """
     clocks = [clock] * len(lengths) if isinstance(clock, Clock) else clock
-    schedules: list[Schedule | None] = [None] * len(lengths)
+    schedules: Iterable[Schedule | None] = [None] * len(lengths)
     even = len(set(clocks)) == 1 and clocks[0].is_even
     if even and len(lengths) >= _FEWEST and min(lengths) > 0 and batchable(services, policy):
         times, rule = cast("Sequence[Times]", services), cast(LanePolicy, policy)
-        for lanes in _chunks(lengths):
-            sizes, some = np.array([lengths[i] for i in lanes]), [times[i] for i in lanes]
-            for i, schedule in zip(lanes, _together(sizes, clocks[0], some, rule)):
-                schedules[i] = schedule
+        numbers = _in_numbers(rule, clocks[0], max(lengths))
+        if numbers is not None and compiled():
+            schedules = _by_kernel(lengths, clocks[0], times, numbers, scores_latency(policy))
+        else:
+            schedules = _in_step(lengths, clocks[0], times, rule)
     for length, of, service, schedule in zip(lengths, clocks, services, schedules):
         yield schedule or simulate(length, of, service, policy)
+
+
+def _in_numbers(policy: LanePolicy, clock: Clock, longest: int) -> tuple[int, int] | None:
+    """A policy's rule as kernels take it; None if it, or the clock, has no form for them."""
+    fits = max(longest * clock.frame_ticks, clock.ticks_per_ns) <= MAX_INT64
+    if "in_numbers" in vars(type(policy)) and fits and clock.frame_ticks >= _FEWEST_TICKS:
+        return cast(CompiledPolicy, policy).in_numbers(clock)
+    return None
+
+
+def _by_kernel(
+    lengths: Sequence[int],
+    clock: Clock,
+    times: Sequence[Times],
+    numbers: tuple[int, int],
+    scored: bool,
+) -> Iterator[Schedule | None]:
+    """The schedules of lanes, some after some; None for those that the SimPy engine is to have."""
+    from lae_sim.engine.kernels import schedule_lanes
+
+    begin = 0
+    while begin < len(lengths):
+        end = begin + 1
+        frames = lengths[begin]
+        while end < len(lengths) and frames + lengths[end] <= _CELLS:
+            frames += lengths[end]
+            end += 1
+        own = [lane.ns for lane in times[begin:end]]
+        calls = np.empty(len(own), np.int64)
+        rows = np.empty((3, frames), np.int64)
+        schedule_lanes(
+            np.array(lengths[begin:end]),
+            clock.frame_ticks,
+            clock.ticks_per_ns,
+            np.concatenate(own),
+            np.cumsum([0, *map(len, own)]),
+            np.array([lane.by_call for lane in times[begin:end]]),
+            *numbers,
+            rows,
+            calls,
+        )
+        at = 0
+        for length, count in zip(lengths[begin:end], calls.tolist()):
+            if count < 0:
+                yield None
+                continue
+            frame, start, ready = rows[:, at : at + count]
+            yield Schedule(clock, length, frame, start, ready, scored)
+            at += count
+        begin = end
+
+
+def _in_step(
+    lengths: Sequence[int], clock: Clock, times: Sequence[Times], policy: LanePolicy
+) -> list[Schedule | None]:
+    """The same by NumPy: the k-th calls of lanes of similar lengths at once."""
+    schedules: list[Schedule | None] = [None] * len(lengths)
+    for lanes in _chunks(lengths):
+        sizes, some = np.array([lengths[i] for i in lanes]), [times[i] for i in lanes]
+        for i, schedule in zip(lanes, _together(sizes, clock, some, policy)):
+            schedules[i] = schedule
+    return schedules
 
 
 def _chunks(lengths: Sequence[int]) -> Iterator[list[int]]:

@@ -36,6 +36,19 @@ class LanePolicy(Protocol):
         """
 
 
+class CompiledPolicy(LanePolicy, Protocol):
+    """One whose rule two numbers say, so that it can be compiled (:mod:`.engine.kernels`)."""
+
+    def in_numbers(self, clock: Clock) -> tuple[int, int] | None:
+        """The rule of ``next_lanes`` where frames arrive evenly.
+
+        Returns:
+            The stride of a policy that takes every n-th frame, or 0; and from how many ticks after
+            the newest frame's arrival on it waits for the next, or 0 if it never does. None if it
+            has no such form.
+        """
+
+
 def _later(a: Count, b: Count) -> Count:
     """The greater of two frames, or of each two."""
     if type(a) is int:  # np.maximum on two numbers takes as long as the rest of the engine
@@ -77,6 +90,9 @@ class _Latest(_ByLastCall):
     def next_lanes(self, clock: Clock, last: Count, now: Count) -> Count:
         return _later(clock.newest(now), last + 1)
 
+    def in_numbers(self, clock: Clock) -> tuple[int, int]:
+        return 0, 0
+
 
 @dataclass(frozen=True)
 class _Every(_ByLastCall):
@@ -88,6 +104,9 @@ class _Every(_ByLastCall):
 
     def next_lanes(self, clock: Clock, last: Count, now: Count) -> Count:
         return last + min(self.n, _BEYOND)
+
+    def in_numbers(self, clock: Clock) -> tuple[int, int] | None:
+        return (min(self.n, _BEYOND), 0) if self.n > 0 else None
 
 
 @dataclass(frozen=True)
@@ -103,6 +122,10 @@ class _ShrinkingTail(_ByLastCall):
         expected = self.expected_ns * clock.ticks_per_ns
         chosen: Count = newest + clock.tail_shrinks(newest, now, expected)
         return _later(chosen, last + 1)
+
+    def in_numbers(self, clock: Clock) -> tuple[int, int]:
+        interval, expected = clock.frame_ticks, self.expected_ns * clock.ticks_per_ns
+        return 0, interval - expected % interval if expected > interval else 0
 
 
 _BEYOND = 2**40  # no sequence has so many frames

@@ -13,13 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from math import lcm
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim._arrays import Bools, Floats, Frames, Ints
+from lae_sim._compiled import compiled
 from lae_sim.engine.clock import MAX_INT64, Clock
 from lae_sim.engine.scheduler import Schedule
 from lae_sim.errors import LaeError
@@ -28,7 +29,21 @@ MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
 _NEVER = 2**62
 _WIDE = 8  # from so many sigmas on, reduceat is slower than a loop over the sequences
 _CELLS = 1 << 17  # outputs x sigmas at once, so that they stay in the cache
-Frames = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class _Gaps:
+    """Distances of frames in each sequence at each sigma, int64 [S, M].
+
+    Attributes:
+        source_sum: sum of psi(i) over the world frames.
+        mismatch: largest i - psi(i).
+        hold: most frames that one output answered.
+    """
+
+    source_sum: Ints
+    mismatch: Ints
+    hold: Ints
 
 
 @dataclass(frozen=True)
@@ -84,26 +99,49 @@ class Pairing:
     @property
     def mismatch_sum(self) -> Ints:
         """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""
-        if len(self.sigmas) < _WIDE:
-            answered = self.end - self.first
-            source_sum = np.add.reduceat(answered * self.frames[:, None], self.offsets[:-1])
-        else:
-            source_sum = np.stack(
-                [self.frames[s] @ (self.end[s] - self.first[s]) for s in self._spans()]
-            )
-        return (self.lengths * (self.lengths - 1) // 2)[:, None] - source_sum
+        return (self.lengths * (self.lengths - 1) // 2)[:, None] - self._gaps.source_sum
 
     @property
     def mismatch_max(self) -> Ints:
         """Largest i - psi(i) of each sequence, frames, int64 [S, M]."""
-        # An output that answers nothing cannot have the maximum: the query before its turn was
-        # answered by an older one.
-        return self._largest_gap((self.frames + 1).astype(np.int32)[:, None])
+        return self._gaps.mismatch
 
     @property
     def longest_hold(self) -> Ints:
         """Most queries in a row that one output answered, frames, int64 [S, M]."""
-        return self._largest_gap(self.first)
+        return self._gaps.hold
+
+    @cached_property
+    def _gaps(self) -> _Gaps:
+        gaps = _Gaps(*np.empty((3, len(self.lengths), len(self.sigmas)), np.int64))
+        if compiled():
+            from lae_sim.evaluation import kernels
+
+            outputs = self.offsets, self.frames, self.first, self.end
+            kernels.sum_gaps(*outputs, gaps.source_sum, gaps.mismatch, gaps.hold)
+        elif len(self.sigmas) < _WIDE:
+            answered = self.end - self.first
+            begins = self.offsets[:-1]
+            gaps.source_sum[:] = np.add.reduceat(answered * self.frames[:, None], begins)
+            gaps.mismatch[:] = np.maximum.reduceat(self.end - self._nexts[:, None], begins)
+            gaps.hold[:] = np.maximum.reduceat(answered, begins)
+        else:
+            spans = map(slice, self.offsets[:-1].tolist(), self.offsets[1:].tolist())
+            for s, span in enumerate(spans):  # so few that what is made of them is in the cache
+                answered = self.end[span] - self.first[span]
+                gaps.source_sum[s] = self.frames[span] @ answered
+                gaps.mismatch[s] = (self.end[span] - self._nexts[span, None]).max(axis=0)
+                gaps.hold[s] = answered.max(axis=0)
+        return gaps
+
+    @property
+    def _nexts(self) -> Frames:
+        """The frame after each output's, int32 [n].
+
+        An output that answers nothing cannot have the largest mismatch: the query before its turn
+        was answered by an older one.
+        """
+        return (self.frames + 1).astype(np.int32)
 
     @property
     def age_sum(self) -> Floats:
@@ -125,8 +163,12 @@ class Pairing:
     @property
     def age_max(self) -> Floats:
         """The largest such time, nominal frame intervals, float64 [S, M]."""
-        last = np.maximum(self.end - 1, 0)  # see mismatch_max on outputs that answer nothing
-        return self._longest(self.mismatch_max, lambda o: (self.frames[o, None], last[o]))
+
+        def span(outputs: slice) -> tuple[Ints, Frames]:
+            # see _nexts on outputs that answer nothing
+            return self.frames[outputs, None], np.maximum(self.end[outputs] - 1, 0)
+
+        return self._longest(self.mismatch_max, span)
 
     @property
     def longest_stale(self) -> Floats:
@@ -172,17 +214,6 @@ class Pairing:
     def _uneven(self) -> Iterator[tuple[int, Clock]]:
         """The sequences whose frames arrive at times of their own, by their places."""
         return ((s, clock) for s, clock in enumerate(self.clocks) if not clock.is_even)
-
-    def _largest_gap(self, begin: Frames) -> Ints:
-        """The largest distance of ``end`` from another frame in each sequence, int64 [S, M]."""
-        if len(self.sigmas) < _WIDE:
-            return np.maximum.reduceat(self.end - begin, self.offsets[:-1]).astype(np.int64)
-        largest = [(self.end[span] - begin[span]).max(axis=0) for span in self._spans()]
-        return np.stack(largest).astype(np.int64)
-
-    def _spans(self) -> Iterator[slice]:
-        """The outputs of each sequence: few enough that what is made of them stays in the cache."""
-        return map(slice, self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
 
 def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int = 0) -> Pairing:
@@ -353,6 +384,8 @@ def histories(pairing: Pairing, memoryless: bool = False) -> Histories:
     look at the latest output alone, one history of all outputs serves every sigma.
     """
     count = len(pairing.sigmas)
+    if not memoryless and compiled():
+        return _histories_by_kernel(pairing)
     used = pairing.end > pairing.first
     used[pairing.offsets[:-1]] = True  # every forecaster starts from the initial box
     begins = np.zeros((len(pairing.lengths), count), np.bool_)
@@ -361,9 +394,7 @@ def histories(pairing: Pairing, memoryless: bool = False) -> Histories:
         used[:] = True
     elif count > 1:
         begins[:, 1:] = np.logical_or.reduceat(used[:, 1:] != used[:, :-1], pairing.offsets[:-1])
-    sequence, sigma_from = np.nonzero(begins)
-    sigma_to = np.append(sigma_from[1:], 0)
-    sigma_to[sigma_to == 0] = count
+    sequence, sigma_from, sigma_to = _shared_ranges(begins)
     sizes = np.diff(pairing.offsets)[sequence]
     output = ranges(pairing.offsets[sequence], sizes)
     history = np.repeat(np.arange(len(sequence)), sizes)
@@ -371,6 +402,34 @@ def histories(pairing: Pairing, memoryless: bool = False) -> Histories:
     items = np.bincount(history[kept], minlength=len(sequence))
     offsets = np.concatenate([[0], np.cumsum(items)])
     return Histories(sequence, sigma_from, sigma_to, offsets, output[kept])
+
+
+def _histories_by_kernel(pairing: Pairing) -> Histories:
+    from lae_sim.evaluation import kernels
+
+    outputs = pairing.offsets, pairing.first, pairing.end
+    begins = np.zeros((len(pairing.lengths), len(pairing.sigmas)), np.bool_)
+    begins[:, 0] = True
+    kernels.changes(*outputs, begins)
+    sequence, sigma_from, sigma_to = _shared_ranges(begins)
+    sizes = np.diff(pairing.offsets)[sequence]
+    items = np.empty(len(sequence), np.int64)
+    output = np.empty(sizes.sum(), np.int64)
+    kernels.used_outputs(*outputs, sequence, sigma_from, items, output)
+    offsets = np.concatenate([[0], np.cumsum(items)])
+    return Histories(sequence, sigma_from, sigma_to, offsets, output[: offsets[-1]])
+
+
+def _shared_ranges(begins: Bools) -> tuple[Ints, Ints, Ints]:
+    """The sequences of histories, and the ranges of sigmas that share one, int64 [L] each.
+
+    Args:
+        begins: whether one begins at a sigma, bool [S, M]; always at the first.
+    """
+    sequence, sigma_from = np.nonzero(begins)
+    sigma_to = np.append(sigma_from[1:], 0)
+    sigma_to[sigma_to == 0] = begins.shape[1]
+    return sequence, sigma_from, sigma_to
 
 
 @dataclass(frozen=True)
@@ -396,6 +455,8 @@ class Pairs:
 
 def pairs(pairing: Pairing, fed: Histories) -> Pairs:
     """List the distinct pairs of frames and outputs, with the sigmas each is for."""
+    if pairing.steps is not None and pairing.next_steps is not None and compiled():
+        return _pairs_by_kernel(pairing, fed, pairing.steps, pairing.next_steps)
     sizes = np.diff(fed.offsets)
     low, high = np.repeat(fed.sigma_from, sizes), np.repeat(fed.sigma_to, sizes)
     count = len(pairing.sigmas)
@@ -422,6 +483,18 @@ def pairs(pairing: Pairing, fed: Histories) -> Pairs:
         ends[several] = limit(seen, ends.take(several))
     kept = listed.sigma_from < listed.sigma_to
     return listed if kept.all() else listed.some(kept)
+
+
+def _pairs_by_kernel(pairing: Pairing, fed: Histories, steps: Ints, next_steps: Ints) -> Pairs:
+    from lae_sim.evaluation import kernels
+
+    histories = fed.offsets, fed.output, fed.sigma_from, fed.sigma_to
+    answered = pairing.first, pairing.end
+    columns = np.empty((4, kernels.most_pairs(*histories, *answered)), np.int64)
+    sees = steps, next_steps
+    grid = pairing.scale, pairing.sigmas
+    count = kernels.list_pairs(*histories, *answered, *sees, *grid, columns)
+    return Pairs(*columns[:, :count])
 
 
 def _count_above(rows: Frames, row: Ints, values: Ints) -> Ints:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim._compiled import compiled
 from lae_sim.evaluation.metrics import (
     CENTRE_THRESHOLDS,
     METRICS,
@@ -27,6 +28,7 @@ from lae_sim.evaluation.pairing import Histories, Pairs, ranges
 from lae_sim.trace.recording import Recording
 
 _CHUNK = 1 << 14  # pairs at once: what is made of them stays in the cache
+_SUMS = (*METRICS, "within50")
 _EXACT = 52  # bits of whole numbers that float64 holds, with one to spare
 
 
@@ -85,26 +87,61 @@ class Scorer:
     ) -> Scored:
         """Score answers, each part with the sequence of each pair, int64 [P]."""
         tally = _Tally(self._lengths, count, curves_at, self._convention.thresholds)
+        counted = self._by_kernel if compiled() else self._by_numpy
         for part in parts:
-            sequence, paired, boxes = _kept(*part, self._convention)
-            for begin in range(0, len(boxes), _CHUNK):
-                now = slice(begin, begin + _CHUNK)
-                some = paired.some(now)
-                truth = self._truth.take(self._bases[sequence[now]] + some.frame, axis=1).T
-                counts = frame_counts(truth, boxes[now], some.frame, self._convention)
-                tally.add(sequence[now], some, counts)
+            counted(tally, *_kept(*part, self._convention))
         tally.failure[~self._is_scored] = -1
         thresholds = {"auc": self._convention.thresholds, "norm_auc": len(NORM_THRESHOLDS)}
-        counted = self._counted[:, None]
-        scores = {m: tally.sums[m] / (counted * thresholds.get(m, 1)) for m in METRICS}
-        success, precision = tally.success / counted, tally.precision / counted
+        every = self._counted[:, None]
+        sums = tally.sums
+        scores = {m: sums[m] / (every * thresholds.get(m, 1)) for m in METRICS}
+        success, precision = tally.success / every, tally.precision / every
         if self._convention.drops_zeros:
             bests = ("auc", "within50", "norm_auc", "norm_auc")
             for metric, best in zip(METRICS, bests):
-                scores[metric] = np.where(tally.sums[best] > 0, scores[metric], np.nan)
+                scores[metric] = np.where(sums[best] > 0, scores[metric], np.nan)
             success[np.isnan(scores["auc"][:, curves_at])] = np.nan
             precision[np.isnan(scores["dp20"][:, curves_at])] = np.nan
         return Scored(scores, tally.failure, success, precision)
+
+    def _by_numpy(self, tally: _Tally, sequence: Ints, paired: Pairs, boxes: Floats) -> None:
+        """Count pairs, so many at once that what is made of them stays in the cache."""
+        for begin in range(0, len(boxes), _CHUNK):
+            now = slice(begin, begin + _CHUNK)
+            some = paired.some(now)
+            truth = self._truth.take(self._bases[sequence[now]] + some.frame, axis=1).T
+            tally.add(
+                sequence[now],
+                some,
+                frame_counts(truth, boxes[now], some.frame, self._convention),
+            )
+
+    def _by_kernel(self, tally: _Tally, sequence: Ints, paired: Pairs, boxes: Floats) -> None:
+        """Count pairs one after another; equal bit for bit."""
+        from lae_sim.evaluation.kernels import count_pairs
+
+        convention = self._convention
+        steps, success, precision = tally.empty()
+        count_pairs(
+            self._bases,
+            self._truth,
+            sequence,
+            paired.frame,
+            paired.sigma_from,
+            paired.sigma_to,
+            np.ascontiguousarray(boxes),
+            ("size", "positive", "finite").index(convention.valid),
+            convention.leaves_out,
+            convention.by_centre,
+            convention.first_frame_is_truth,
+            convention.thresholds - 1,
+            tally.curves_at,
+            steps,
+            success,
+            precision,
+            tally.failure,
+        )
+        tally.add_counted(steps, success, precision)
 
 
 class _Tally:
@@ -132,9 +169,8 @@ class _Tally:
     """
 
     def __init__(self, lengths: Ints, count: int, curves_at: int, thresholds: int) -> None:
-        self._count, self._curves_at = count, curves_at
-        names = (*METRICS, "within50")
-        self.sums = {name: np.zeros((len(lengths), count), np.int64) for name in names}
+        self._count, self.curves_at = count, curves_at
+        self.sums = {name: np.zeros((len(lengths), count), np.int64) for name in _SUMS}
         self.failure = np.repeat(lengths[:, None], count, axis=1)
         self.success = np.zeros((len(lengths), thresholds))
         self.precision = np.zeros((len(lengths), len(CENTRE_THRESHOLDS)))
@@ -162,16 +198,40 @@ class _Tally:
                 self.sums[name][here] += sums & (1 << bits) - 1
                 sums >>= bits
         shown = np.flatnonzero(
-            (paired.sigma_from <= self._curves_at) & (self._curves_at < paired.sigma_to)
+            (paired.sigma_from <= self.curves_at) & (self.curves_at < paired.sigma_to)
         )
         of_shown = local.take(shown)
         for curves, passed in (
             (self.success, counts.success),
             (self.precision[:, ::-1], counts.precision),
         ):
-            shape = len(here), curves.shape[1]
-            curves[here] += _above(of_shown, passed.take(shown).astype(np.int64), *shape)
+            width = curves.shape[1] + 1
+            cell = of_shown * width + passed.take(shown).astype(np.int64)
+            curves[here] += _above(np.bincount(cell, minlength=len(here) * width), width)
         self._note_failures(sequence, paired, np.flatnonzero(counts.apart))
+
+    def empty(self) -> tuple[Ints, Ints, Ints]:
+        """Arrays to count in for :meth:`add_counted`."""
+        sequences = len(self.failure)
+        return (
+            np.zeros((sequences, self._count + 1, len(_SUMS)), np.int64),
+            np.zeros((sequences, self.success.shape[1] + 1), np.int64),
+            np.zeros((sequences, self.precision.shape[1] + 1), np.int64),
+        )
+
+    def add_counted(self, steps: Ints, success: Ints, precision: Ints) -> None:
+        """Add pairs that are counted.
+
+        Args:
+            steps: values where their ranges begin, less those where they end, in the order of
+                ``_SUMS``: int64 [S, M + 1, 5].
+            success, precision: how many frames of the curves pass 0, 1, 2, ... thresholds, int64
+                [S, thresholds + 1].
+        """
+        for k, name in enumerate(_SUMS):
+            self.sums[name] += steps[:, :-1, k].cumsum(axis=1)
+        self.success += _above(success, success.shape[1])
+        self.precision += _above(precision, precision.shape[1])[:, ::-1]
 
     def _note_failures(self, sequence: Ints, paired: Pairs, lost: Ints) -> None:
         """Note the first pair of each sequence and sigma that is lost."""
@@ -225,9 +285,11 @@ def _columns(boxes: Sequence[Floats]) -> Floats:
     return np.ascontiguousarray(np.concatenate(boxes).T)
 
 
-def _above(sequence: Ints, passed: Ints, sequences: int, most: int) -> Ints:
-    """How many frames passed more than 0, 1, ..., ``most`` - 1 thresholds, int64 [S, most]."""
-    width = most + 1
-    counts = np.bincount(sequence * width + passed, minlength=sequences * width)
+def _above(counts: Ints, width: int) -> Ints:
+    """How many frames passed more than 0, 1, 2, ... thresholds, int64 [S, width - 1].
+
+    Args:
+        counts: how many passed 0, 1, 2, ... of them, S rows of that width.
+    """
     above: Ints = counts.reshape(-1, width)[:, :0:-1].cumsum(axis=1)[:, ::-1]
     return above

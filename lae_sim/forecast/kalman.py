@@ -16,6 +16,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim._compiled import compiled
 from lae_sim.boxes import iou
 from lae_sim.errors import LaeError
 from lae_sim.forecast.base import ImageSize, Lanes
@@ -23,6 +24,8 @@ from lae_sim.forecast.base import ImageSize, Lanes
 RESTART_IOU = 0.3
 LEAST_AREA = 75
 _CHUNK = 1 << 14  # forecasts at once: what is made of them stays in the cache
+
+_LONGEST = 1 << 20  # frames, of a table of intervals
 
 Number = TypeVar("Number", float, Floats)
 
@@ -69,6 +72,10 @@ class TunedKalman:
         self, lanes: Lanes, item: Ints, frame: Ints | Floats, restart_iou: float | None = None
     ) -> Floats:
         """The same for many lanes at once; restarts as in :func:`filter_lanes`."""
+        if compiled():
+            tables = self._tables(lanes, item, frame)
+            if tables is not None:
+                return self._by_kernel(lanes, item, frame, restart_iou, tables)
         states, place = filter_lanes(lanes, self, restart_iou)
         forecasts = np.empty((4, len(item)))
         for begin in range(0, len(item), _CHUNK):
@@ -79,6 +86,48 @@ class TunedKalman:
             velocity *= self.reach(ahead.astype(np.float64))
             np.add(position, velocity, out=forecasts[:, now])
         return self.boxes(forecasts.T)
+
+    def _by_kernel(
+        self,
+        lanes: Lanes,
+        item: Ints,
+        frame: Ints | Floats,
+        restart_iou: float | None,
+        tables: tuple[Floats, Floats],
+    ) -> Floats:
+        from lae_sim.forecast.kernels import kalman_lanes
+
+        forecasts = np.empty((len(item), 4))
+        kalman_lanes(
+            lanes.offsets,
+            lanes.frames,
+            self.states(lanes.boxes),
+            *tables,
+            self.q,
+            self.r,
+            self.p0,
+            -1.0 if restart_iou is None else restart_iou,
+            item,
+            frame,
+            forecasts,
+        )
+        return self.boxes(forecasts)
+
+    def _tables(
+        self, lanes: Lanes, item: Ints, frame: Ints | Floats
+    ) -> tuple[Floats, Floats] | None:
+        """What is left of the velocity after 0, 1, 2, ... frames, and its reach.
+
+        They are empty where it does not decay, and None where intervals are no such numbers.
+        """
+        if self.decay == 1:
+            return np.empty(0), np.empty(0)
+        ahead = frame - lanes.frames.take(item)
+        most = max(int(lanes.frames.max()), int(ahead.max(initial=0)))
+        if lanes.numbers is not None or ahead.min(initial=0) < 0 or most > _LONGEST:
+            return None
+        keep, reach, _ = self.transition(np.arange(most + 1.0))
+        return keep, reach
 
     def reach(self, interval: Number) -> Number:
         """How many frames' velocity an interval of so many frames is worth."""

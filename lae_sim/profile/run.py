@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 MODES = ("every-frame", "real-time")
-_FAILURES = 20  # of a pass that are told one by one
+_FAILURES = 20  # that are told one by one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -357,17 +357,17 @@ def _run(
                 interrupted = error
     with _kept(unfinished):
         written = [t for t in passes if write_pass(t, journal, failures.get(t.name, []))]
-    if not interrupted:
+    if not interrupted or not written:
         journal.remove()
     failed = tuple(failure for each in failures.values() for failure in each)
-    for each in failures.values():
-        for failure in each[:_FAILURES]:
-            notice(f"failed: {failure.reason}")
-        if len(each) > _FAILURES:
-            notice(f"failed: and {len(each) - _FAILURES:,} more")
+    reasons = list(dict.fromkeys(failure.reason for failure in failed))  # passes fail alike
+    for reason in reasons[:_FAILURES]:
+        notice(f"failed: {reason}")
+    if len(reasons) > _FAILURES:
+        notice(f"failed: and {len(reasons) - _FAILURES:,} more")
     if interrupted:
-        kept = f"{path} holds what is complete; " if written else ""
-        notice(f"{kept}--resume goes on")
+        kept = f"{path} holds what is complete; --resume goes on"
+        notice(kept if written else "no sequence is complete yet: nothing is kept")
         raise interrupted
     if not written:
         raise LaeError("no sequence could be profiled")

@@ -466,7 +466,10 @@ def parse_latency(text: str) -> LatencySource:
     if colon and name not in ("recorded", "by-call"):
         source: LatencySource = _plugin("latency", text, _LATENCIES, ("recording",))
         return source
-    meant = f"; did you mean constant:{text:.40}?" if text[:1].isdigit() else hint(name, _LATENCIES)
+    meant = hint(name, _LATENCIES)
+    if text[:1].isdigit():
+        unit = "" if text[-1:].isalpha() else "ms"
+        meant = f"; did you mean constant:{text:.40}{unit}?"
     raise LaeError(
         f"no latency {shown(text)}: there are recorded, by-call, constant:47ms, resample:SEED, "
         f"lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object, all of them perhaps with "

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
 from lae_sim import __version__
+from lae_sim._compiled import expect
 from lae_sim.errors import LaeError, explained
 from lae_sim.files import text_digest
 from lae_sim.study.cells import Cell, Input, Result, Setting, Task, compute
@@ -35,12 +36,17 @@ class Description:
 Work: TypeAlias = Description | Task | Search
 
 
-def attempt(work: Work) -> Any:
+def attempt(work: Work, share: int = 0) -> Any:
     """Do a piece of work, on some worker; what cannot be done is a :class:`Failure`.
+
+    Args:
+        work: which.
+        share: how much a worker does in the whole study (see :func:`lae_sim._compiled.amount`).
 
     Returns:
         Of a description or a search its document, of a task the result or failure of each cell.
     """
+    expect(share)
     try:
         with explained("failed"):
             for trace in _inputs(work):

@@ -34,7 +34,10 @@ def find_traces(patterns: Sequence[str], base: Path | None = None) -> list[str]:
         with _explained(pattern):
             names = _remote(pattern) if is_url(pattern) else _local(pattern, base)
         if not names:
-            raise LaeError(f"{pattern}: no trace is there (of a folder, *.parquet are taken)")
+            raise LaeError(
+                f"{pattern}: no trace is there (of a folder, *.parquet are taken; lae-sim convert "
+                "makes traces of a toolkit's results)"
+            )
         for name in sorted(names):
             same = name.removeprefix("file://")
             traces.setdefault(same if is_url(same) else os.path.realpath(same), name)

@@ -470,3 +470,7 @@ def test_a_video_without_truth_shows_itself_without_a_score(tmp_path: Path) -> N
     assert repr(result).endswith(": AUC hold -, kalman ->")
     assert result.summary[["auc", "dp20", "offline_auc"]].isna().all(axis=None)
     assert "nan" not in result._repr_html_().lower()
+    with pytest.raises(
+        lae_sim.LaeError, match="nothing to draw: no sequence has a ground truth after"
+    ):
+        result.plot()

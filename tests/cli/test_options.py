@@ -120,6 +120,16 @@ def test_a_latency_that_is_none_is_an_error(text):
         parse_latency(text)
 
 
+def test_an_option_that_is_none_is_told_what_was_perhaps_meant(capsys):
+    for words, meant in (
+        (["--forecasters", "kalman"], "--forecaster"),
+        (["--latncy=47ms"], "--latency"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["replay", "a.parquet", *words])
+        assert f"; did you mean '{meant}'? (lae-sim replay --help" in capsys.readouterr().err
+
+
 def test_running_out_of_memory_is_one_line(capsys):
     def python():
         raise MemoryError

@@ -453,6 +453,8 @@ def test_a_video_without_truth_has_no_score(tmp_path, convention, options):
     assert lines
     assert all(line.count("-") >= 8 and "nan" not in line for line in lines)
     assert "1 of 1 sequences have no ground truth after the first frame" in " ".join(out.split())
+    assert report["search"] is None  # of scores that there are not, the model says nothing
+    assert "--gaps" not in out
 
 
 def test_attributes_that_there_are_not_make_an_empty_table():

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from compiling import BOTH_WAYS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from places import SHARED
 from witness import RATES, times
 
 from lae_sim._arrays import Ints
+from lae_sim._compiled import SWITCH
 from lae_sim.engine import lanes as batch
 from lae_sim.engine.clock import Clock, parse_fps
 from lae_sim.engine.lanes import batchable, simulate_lanes
@@ -67,8 +69,9 @@ def at_once(
     return found
 
 
-@pytest.fixture(autouse=True)
-def even_one_lane(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, params=BOTH_WAYS)
+def even_one_lane(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SWITCH, request.param)
     monkeypatch.setattr(batch, "_FEWEST", 1)
 
 
