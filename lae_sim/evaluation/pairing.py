@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from math import lcm
 from typing import Any
 
@@ -81,7 +82,7 @@ class Pairing:
             self.clocks[sequence : sequence + 1],
         )
 
-    @property
+    @cached_property
     def mismatch_sum(self) -> Ints:
         """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""
         if len(self.sigmas) < _WIDE:
@@ -93,14 +94,14 @@ class Pairing:
             )
         return (self.lengths * (self.lengths - 1) // 2)[:, None] - source_sum
 
-    @property
+    @cached_property
     def mismatch_max(self) -> Ints:
         """Largest i - psi(i) of each sequence, frames, int64 [S, M]."""
         # An output that answers nothing cannot have the maximum: the query before its turn was
         # answered by an older one.
         return self._largest_gap((self.frames + 1).astype(np.int32)[:, None])
 
-    @property
+    @cached_property
     def longest_hold(self) -> Ints:
         """Most queries in a row that one output answered, frames, int64 [S, M]."""
         return self._largest_gap(self.first)
