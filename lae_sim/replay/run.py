@@ -24,9 +24,9 @@ from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes
-from lae_sim.trace.recording import Recording, batched
+from lae_sim.trace.recording import BESIDE, Recording, batched
 
-_GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
+_GROUP_FRAMES = 1 << 16  # world frames of the sequences that are in memory at once
 _LEAST = 0.2  # weight of the farther of two strides beside a step
 _LANE_FRAMES = 1 << 21  # and of their repetitions
 
@@ -350,7 +350,7 @@ class Runs:
                 service = self.source(job.times)
             jobs.append(job)
             services.append(service)
-            pending += len(job)
+            pending += len(job) + BESIDE
             if pending >= _GROUP_FRAMES or not batchable([service], self.policy):
                 yield jobs, services
                 jobs, services, pending = [], [], 0
@@ -418,7 +418,7 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
     source = runs.source
     if not isinstance(source, RandomSource):
         raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
-    for jobs in batched(runs._jobs(), _GROUP_FRAMES):
+    for jobs in batched(runs._jobs(), _GROUP_FRAMES, BESIDE):
         size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
         for begin in range(first, first + count, size):
             some = range(begin, min(begin + size, first + count))
