@@ -10,13 +10,16 @@ from typing import Any
 
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
-from lae_sim.progress import ProgressBar
+from lae_sim.figures.study import study_in_columns
+from lae_sim.plugins import looking_in
+from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
-from lae_sim.report.study_tables import write_tables
-from lae_sim.report.study_view import View
+from lae_sim.report.paper import Paper, remove_paper, write_paper
+from lae_sim.report.study_tables import paper_tables
 from lae_sim.study.run import StudyResults, check_inputs, compute_study
 from lae_sim.study.spec import Study, read_study
+from lae_sim.study.view import View
 
 
 def run_study(
@@ -26,7 +29,7 @@ def run_study(
     workers: int | None = None,
     scheduler: str | None = None,
     report: bool = True,
-    progress: bool | None = None,
+    progress: ShowProgress = None,
     **keys: Any,
 ) -> StudyResults:
     """Replay and score many traces in many worlds, or go on where an earlier run stopped.
@@ -38,8 +41,9 @@ def run_study(
             Finished parts found there are not computed again.
         workers: processes on this machine; by default one for each core. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead.
-        report: whether to write ``report.html`` and ``tables/`` too.
-        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        report: whether to write ``report.html``, ``figures/`` and ``tables/`` too.
+        progress: whether to show a progress bar, by default on a terminal and in a notebook; or a
+            function, which is told: ``progress(done, total, what)``.
         keys: keys of the study file (see :class:`Study`).
 
     In a script, call it under ``if __name__ == "__main__":``, since workers import the script.
@@ -65,7 +69,7 @@ def run_study(
         if scheduler is not None:
             raise LaeError("workers: for this machine: a scheduler says where to compute instead")
     made, base, kept = _asked_for(study, keys, folder)
-    with ProgressBar("study", "tasks", progress) as bar:
+    with ProgressBar("study", "tasks", progress) as bar, looking_in(base or "."):
 
         def advance(what: str, done: int, total: int) -> None:
             bar(done, total, what)
@@ -88,7 +92,8 @@ def _asked_for(
         return Study.of(keys if study is None else study), None, kept
     if not isinstance(study, (str, os.PathLike)) or str(study).endswith(".parquet"):
         raise LaeError(
-            f"study: {shown(study)} is no TOML file and no Study; name traces by traces=..."
+            f"study: {shown(study)} is no TOML file and no Study; name traces by traces=... (in a "
+            'TOML file: traces = ["a.parquet", "b.parquet"])'
         )
     path = Path(study)
     kept = folder or f"{path.stem}-results"
@@ -97,12 +102,13 @@ def _asked_for(
 
 
 def write_views(results: StudyResults, report: bool = True) -> None:
-    """Write the report and the tables of a study beside its results, or take old ones away."""
-    page, tables = results.folder / "report.html", results.folder / "tables"
+    """Write the report and what a paper needs beside a study's results, or take old ones away."""
+    page = results.folder / "report.html"
     if report:
         view = View(results)
-        write_tables(view, tables)
+        frames = {"scores": view.results.scores_frame()}
+        write_paper(Paper(study_in_columns(view), paper_tables(view), frames), results.folder)
         write_report(view, page)
         return
-    for path in (page, *tables.glob("*.*")):
-        path.unlink(missing_ok=True)  # it would be of other results
+    remove_paper(results.folder)  # it would be of other results
+    page.unlink(missing_ok=True)

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from lae_sim.cli.options import add_search, check_outputs, exit_status, new_parser, print_json
-from lae_sim.progress import print_text
+from lae_sim.progress import print_text, screen_width
 
 PROGRAM = "lae-sim fidelity"
 
@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
     add("--closed-loop", **several, required=True, help="real-time traces")
     add("--strided", **several, help="passes on every N-th frame, and gap passes")
     add("--forecaster", nargs="+", default=["hold"], metavar="NAME", help="default: hold")
-    add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
+    add("--convention", default="pysot", help="how frames count: as in replay (default: pysot)")
     add_search(made, pre_forecaster=False)
     add("--per-sequence", action="store_true", help="report each sequence")
     add("--json", action="store_true", help="print one JSON object instead of tables")
@@ -67,7 +67,7 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     from lae_sim.report.comparison import fidelity_table, fidelity_verdicts, spread_table
 
     if arguments.plot:
-        from lae_sim.report.style import check_format
+        from lae_sim.figures.style import check_format
 
         check_format(arguments.plot)
         check_outputs(arguments, [arguments.plot], arguments.traces)
@@ -82,8 +82,8 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     summary, spreads = summarise_closed_loops(rows), closed_loop_spreads(rows)
     overall, verdicts = summarise_replays(rows), fidelity_verdicts(rows, spreads)
     if arguments.plot:
-        from lae_sim.report.figures import fidelity_figure
-        from lae_sim.report.style import save
+        from lae_sim.figures.replay import fidelity_figure
+        from lae_sim.figures.style import save
 
         save(fidelity_figure(rows, "Replays against closed loops"), arguments.plot)
     if arguments.json:
@@ -101,13 +101,14 @@ def _fidelity(arguments: argparse.Namespace) -> None:
         document = {**head, **settings, "traces": arguments.traces, **parts, "verdicts": verdicts}
         print_json(document)
         return
+    width = screen_width()
     if arguments.per_sequence:
-        print_text(fidelity_table(rows), end="\n\n")
-    print_text(fidelity_table(summary), end="\n\n")
+        print_text(fidelity_table(rows, width), end="\n\n")
+    print_text(fidelity_table(summary, width), end="\n\n")
     if len({each.closed_loop for each in summary}) > 1:
-        print_text(fidelity_table(overall), end="\n\n")
+        print_text(fidelity_table(overall, width), end="\n\n")
     if spreads:
-        print_text(spread_table(spreads), end="\n\n")
+        print_text(spread_table(spreads, width), end="\n\n")
     print_text(
         f"AUC by convention {arguments.convention}; |d| is |replay - closed loop| of a sequence.\n"
         "every-frame: boxes of TRACE; strided: of the pass nearest to the frames skipped;\n"

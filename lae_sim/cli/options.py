@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import select
 import signal
 import sys
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
 from lae_sim.decoding import MAX_DECODED, max_decoded, parse_size
 from lae_sim.engine.clock import parse_fps, parse_rational, whole
-from lae_sim.errors import LaeError, abridged, visible
+from lae_sim.errors import LaeError, abridged, hint, visible
 from lae_sim.progress import OutputError, print_text, printing, tell
 
 if TYPE_CHECKING:
@@ -206,6 +207,8 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose errors are as short as those of the work."""
 
     def error(self, message: str) -> NoReturn:
+        if unknown := re.match(r"unrecognized arguments: (--[^\s=]+)", message):
+            message += hint(unknown[1], self._option_string_actions)
         tell(f"{self.prog}: error: {abridged(visible(message))} ({self.prog} --help says more)")
         self.exit(2)
 
@@ -377,6 +380,23 @@ def check_outputs(
         if trace_at(path) is not None:
             raise LaeError(f"{path} is a trace: name another file")
     check_places(path for path in written if not os.path.isdir(path))
+
+
+def check_folder(folder: str, or_else: str = "") -> None:
+    """Refuse, before the work, a folder that figures and tables cannot be written to.
+
+    Args:
+        folder: the folder, one of those that :func:`check_outputs` looked at.
+        or_else: what else could be named.
+
+    Raises:
+        LaeError: if it is a file, or called like one, or cannot be written to.
+    """
+    if os.path.isdir(folder):
+        if not os.access(folder, os.W_OK):
+            raise LaeError(f"--out {folder}: it cannot be written to: name another folder")
+    elif os.path.exists(folder) or os.path.splitext(folder)[1]:
+        raise LaeError(f"--out {folder}: name a folder (NAME.WITH.POINTS/ ends in /){or_else}")
 
 
 def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]:

@@ -53,7 +53,7 @@ def _show(arguments: argparse.Namespace) -> None:
 
     paths = find_traces(arguments.traces)
     if arguments.plot:
-        from lae_sim.report.style import check_format
+        from lae_sim.figures.style import check_format
 
         check_outputs(arguments, [arguments.plot], paths)
         check_format(arguments.plot)
@@ -65,7 +65,7 @@ def _show(arguments: argparse.Namespace) -> None:
     reports = [report for report, _ in described]
     reaches = [ReachReport.of(trace) if gaps else None for trace, gaps in zip(traces, are_gaps)]
     if arguments.plot and all(are_gaps):
-        from lae_sim.report.style import save
+        from lae_sim.figures.style import save
 
         save(reach_figure([reach for reach in reaches if reach is not None]), arguments.plot)
     elif arguments.plot:

@@ -15,8 +15,11 @@ from lae_sim.comparison.fidelity import (
     FidelitySummary,
 )
 from lae_sim.comparison.statistics import KEYS
+from lae_sim.errors import visible
+from lae_sim.figures.labels import METRIC_LABELS, setting_label
+from lae_sim.report.paper import PaperTable, TrackerScores, in_two_forms, with_and_without
 from lae_sim.report.table import (
-    METRIC_LABELS,
+    COUNT,
     PERCENT,
     SCORE,
     SIGNED,
@@ -26,22 +29,24 @@ from lae_sim.report.table import (
     ends_text,
     is_unknown,
     p_label,
-    setting_label,
     text_of,
 )
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from lae_sim.trace.metadata import Metadata
+
 Row = Mapping[str, Any]
 
 
-def comparison_table(summary: pd.DataFrame) -> str:
+def comparison_table(summary: pd.DataFrame, width: int | None = None) -> str:
     """The summary as text: a line per trace, setting and forecaster, then how it was computed.
 
     The first metric has intervals and tests, the others have their means; the search model's means
     have its own intervals. ``summary`` is what :func:`summarise` or :func:`by_attribute` gave, or
-    some rows of it, perhaps with the columns of the model.
+    some rows of it, perhaps with the columns of the model. ``width`` is as of
+    :func:`lae_sim.report.table.text_of`.
     """
     first, *others = summary["metric"].unique()
     baselines = [name[3:-7] for name in summary if name.endswith("_better")]
@@ -61,12 +66,13 @@ def comparison_table(summary: pd.DataFrame) -> str:
 
     columns = [
         *(Column(name, name, is_label=True) for name in labels),
-        Column("n", "sequences"),
-        Column(METRIC_LABELS.get(first, first), "mean", SCORE),
+        Column("n", "sequences", importance=3),
+        Column(METRIC_LABELS.get(first, first), "mean", SCORE, importance=9),
         Column("recovered", "recovered", Number(".1f", 100, "%", ".0f")),
         *(column for baseline in baselines for column in _against(baseline)),
-        *(Column(METRIC_LABELS.get(name, name), mean_of(name), SCORE) for name in others),
-    ]
+        *(Column(METRIC_LABELS.get(name, name), mean_of(name), SCORE, importance=4)
+          for name in others),
+    ]  # fmt: skip
     modelled = [
         name[:-4] for name in summary if name.startswith("modelled_") and name[-4:] == "_low"
     ]
@@ -89,7 +95,103 @@ def comparison_table(summary: pd.DataFrame) -> str:
     intervals = [METRIC_LABELS.get(name, name) for name in (first, *modelled)]
     caption = ", ".join(shared) + "\n\n" if shared else ""
     method = f"\n{summary.attrs['method']}" if "method" in summary.attrs else ""
-    return caption + text_of(Table.of(columns, rows), [*intervals, "recovered"]) + method
+    return caption + text_of(Table.of(columns, rows), [*intervals, "recovered"], width) + method
+
+
+def paper_tables(
+    summary: pd.DataFrame,
+    metrics: Sequence[str],
+    metadata: Mapping[str, Metadata],
+    attributes: pd.DataFrame | None = None,
+) -> list[PaperTable]:
+    """The tables of a comparison, whole and for a paper.
+
+    Args:
+        summary: what :func:`summarise` gave.
+        metrics: those compared: AUC first, then DP.
+        metadata: of each trace.
+        attributes: what :func:`by_attribute` gave.
+    """
+    tables = [_paper_table(summary, metrics[0], "comparison")]
+    tables.append(_in_layout(summary, metrics, metadata))
+    if attributes is not None:
+        tables.append(_paper_table(attributes, metrics[0], "attributes"))
+    return tables
+
+
+def _paper_table(summary: pd.DataFrame, metric: str, name: str) -> PaperTable:
+    """A row per trace, setting and forecaster; for a paper at the smallest sigma.
+
+    In a column there are only means and what is recovered.
+    """
+    whole = _comparison(summary, metric, name)
+    at_first = summary[summary["sigma"] == summary["sigma"].min()]
+    long = _comparison(at_first, metric, name)
+    short = long.only(lambda _, column: column.title not in ("n", "vs hold", "p"))
+    return PaperTable(whole, long, short)
+
+
+def _comparison(summary: pd.DataFrame, metric: str, name: str) -> Table:
+    """A row per trace, setting and forecaster, with intervals."""
+    label = METRIC_LABELS.get(metric, metric)
+    rows = summary[summary["metric"] == metric]
+    rows = rows.assign(trace=rows["trace"].str.removesuffix(".parquet"))
+    rows = rows.assign(
+        latency=[setting_label(*both) for both in zip(rows["latency"], rows["scale"])]
+    )
+    rows = rows.rename(columns={"low": "mean_low", "high": "mean_high"})
+    labels = [*(["attribute"] if "attribute" in rows else []), "trace", "latency", "sigma"]
+    shared = [f"{key} {rows[key].iloc[0]}" for key in labels[-3:-1] if rows[key].nunique() == 1]
+    labels = [key for key in labels if rows[key].nunique() > 1]
+    columns = [
+        *(Column(key, key, is_label=True) for key in [*labels, "forecaster"]),
+        Column("n", "sequences", COUNT),
+        Column(label, "mean", SCORE, name=metric),
+        Column("recovered", "recovered", Number(".1f", 100, "%", ".0f")),
+        Column("vs hold", "vs_hold", SIGNED),
+        Column("p", "vs_hold_p", p_label),
+    ]
+    records = rows.to_dict("records")
+    for record in records:
+        if record["forecaster"] in ("hold", "offline"):
+            record["recovered"] = None
+        if record["forecaster"] == "hold":
+            record |= {"vs_hold": None, "vs_hold_p": None}
+    caption = f"{label} of forecasters" + (" by attribute" if "attribute" in rows else "")
+    return Table.of(columns, records, name, "; ".join([caption, *shared]))
+
+
+def _in_layout(
+    summary: pd.DataFrame, metrics: Sequence[str], metadata: Mapping[str, Metadata]
+) -> PaperTable:
+    """Trackers with and without forecasters, at the first sigma."""
+    auc, dp20 = metrics[:2]
+    rows = summary[
+        summary["trace"].isin([*metadata]) & (summary["sigma"] == summary["sigma"].min())
+    ]
+    trackers = {name: visible(each.tracker) for name, each in metadata.items()}
+    kinds = {(each.tracker, each.dataset) for each in metadata.values()}
+    alone = len(kinds) == len(metadata) and "unknown" not in trackers.values()
+    settings = ("latency", "scale")
+    several = rows[[*settings]].drop_duplicates().shape[0] > 1
+    scores = []
+    for (trace, latency, scale), group in rows.groupby(["trace", *settings], sort=False):
+        means = group.set_index(["forecaster", "metric"])["mean"].to_dict()
+        name = trackers[trace] if alone else trace.removesuffix(".parquet")
+        name += f", {setting_label(latency, scale)}" if several else ""
+        offline = {"auc": means.get(("offline", auc)), "dp20": means.get(("offline", dp20))}
+        for forecaster in dict.fromkeys(group["forecaster"]):
+            if forecaster != "offline":
+                of = {"auc": means[forecaster, auc], "dp20": means.get((forecaster, dp20))}
+                dataset = str(metadata[trace].dataset)
+                scores.append(TrackerScores(name, dataset, forecaster, of, offline))
+    titles = {key: METRIC_LABELS[metric].replace("DP@20", "DP") for key, metric in
+              zip(("auc", "dp20"), metrics)}  # fmt: skip
+    latencies = [setting_label(*each) for each in zip(rows["latency"], rows["scale"])]
+    setting = f"sigma {rows['sigma'].iloc[0]:g}" if "mauc" not in auc else "mean over sigma"
+    setting += "" if several else f", latency {latencies[0]}"
+    forecasters = dict.fromkeys(row.forecaster for row in scores)
+    return in_two_forms(with_and_without(scores, forecasters, titles, setting))
 
 
 def _ends(name: str, row: Row) -> str | None:
@@ -100,15 +202,18 @@ def _ends(name: str, row: Row) -> str | None:
 def _against(baseline: str) -> list[Column]:
     """The mean paired difference to a baseline, its p, the sequences better and worse."""
     name = f"vs_{baseline}"
+    importance = 8 if baseline == "hold" else 2
 
     def where_known(text: Callable[[Row], str]) -> Callable[[Row], str | None]:
         return lambda row: None if is_unknown(row[name]) else text(row)
 
     return [
-        Column(f"vs {baseline}", name, SIGNED),
-        Column("p", where_known(lambda row: p_label(row[f"{name}_p"]))),
-        Column("+/-", where_known(lambda row: f"{row[f'{name}_better']}/{row[f'{name}_worse']}")),
-    ]
+        Column(f"vs {baseline}", name, SIGNED, importance=importance),
+        Column("p", where_known(lambda row: p_label(row[f"{name}_p"])),
+               name=f"p vs {baseline}", importance=importance - 1),
+        Column("+/-", where_known(lambda row: f"{row[f'{name}_better']}/{row[f'{name}_worse']}"),
+               name=f"+/- vs {baseline}", importance=2),
+    ]  # fmt: skip
 
 
 _REPLAYED = ("closed_loop", "forecaster", "replay")
@@ -127,12 +232,15 @@ _FIDELITY = {
     "d_dp20": ("d", SIGNED),
     "covered_dp20": ("covered", PERCENT),
 }
+_IMPORTANT = {"mean_abs_d_auc": 9, "auc": 8, "closed_auc": 8, "d_auc": 7, "covered": 7}
 
 
-def fidelity_table(rows: Sequence[FidelityRow] | Sequence[FidelitySummary]) -> str:
+def fidelity_table(
+    rows: Sequence[FidelityRow] | Sequence[FidelitySummary], width: int | None = None
+) -> str:
     """How far replays are from closed loops: a line per closed loop, forecaster and replay.
 
-    Of rows per sequence, a line each.
+    Of rows per sequence, a line each. ``width`` is as of :func:`lae_sim.report.table.text_of`.
     """
     each = isinstance(rows[0], FidelityRow)
     labels = [*_REPLAYED, "sequence"] if each else _REPLAYED
@@ -140,20 +248,26 @@ def fidelity_table(rows: Sequence[FidelityRow] | Sequence[FidelitySummary]) -> s
     if not each:
         columns.append(Column("sequences", "sequences"))
     columns += [
-        Column(title, key, _yes_or_no if each and key.startswith("covered") else form)
+        Column(
+            title,
+            key,
+            _yes_or_no if each and key.startswith("covered") else form,
+            name=f"{title} of DP" if key.endswith("_dp20") else title,
+            importance=_IMPORTANT.get(key, 3 if key.endswith("dp20") else 5),
+        )
         for key, (title, form) in _FIDELITY.items()
         if any(getattr(row, key, None) is not None for row in rows)
     ]
     if each:
         columns += [Column("parted at", "parted"), Column("disagree", "disagreement", SCORE)]
-    return text_of(Table.of(columns, rows))
+    return text_of(Table.of(columns, rows), width=width)
 
 
 def _yes_or_no(value: bool) -> str:
     return "yes" if value else "no"
 
 
-def spread_table(spreads: Sequence[ClosedLoopSpread]) -> str:
+def spread_table(spreads: Sequence[ClosedLoopSpread], width: int | None = None) -> str:
     """How far closed loops of one setting are apart: a line per setting and sequence."""
     several = {each.trace for each in spreads}
     columns = [Column("trace", "trace", is_label=True)] if len(several) > 1 else []
@@ -166,7 +280,7 @@ def spread_table(spreads: Sequence[ClosedLoopSpread]) -> str:
         Column("highest", "auc_high", SCORE),
         Column("apart", "spread", SCORE),
     ]
-    return text_of(Table.of(columns, spreads))
+    return text_of(Table.of(columns, spreads), width=width)
 
 
 _KINDS = {"strided": "strided passes", "every-frame": "recorded boxes alone"}

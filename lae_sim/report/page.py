@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 from lae_sim import __version__
 from lae_sim.errors import visible
 from lae_sim.evaluation.metrics import CONVENTIONS, Convention
+from lae_sim.figures import study as study_figures
+from lae_sim.figures.study import SWEEPS, Picture
 from lae_sim.files import written_whole
-from lae_sim.report import study_figures, study_tables
-from lae_sim.report.study_figures import SWEEPS, Picture
-from lae_sim.report.study_view import View
+from lae_sim.report import study_tables
 from lae_sim.report.table import COUNT, PERCENT, Column, Number, Table
 from lae_sim.study.verdict import shortfalls
+from lae_sim.study.view import View
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
@@ -162,12 +163,8 @@ def _facts(view: View) -> dict[str, str]:
         "by Holm's method for the number of those compared with the best",
         "made with": f"lae_sim {__version__}",
     }
-    made_up = [
-        f"{source.input.label}: {source.metadata.timing_note}"
-        for source in results.plan.sources
-        if source.metadata.timing_note
-    ]
-    return {**facts, **({"times": "; ".join(made_up)} if made_up else {})}
+    times = "; ".join(results.timing_sources())
+    return {**facts, **({"times": times} if times else {})}
 
 
 def _search_facts(results: StudyResults) -> dict[str, str]:

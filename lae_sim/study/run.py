@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
 from lae_sim.errors import LaeError
+from lae_sim.evaluation.caveats import at_the_floor, floor_notes
 from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
@@ -21,7 +24,7 @@ from lae_sim.study.cells import Task
 from lae_sim.study.deployment import Curve, requirement, searches
 from lae_sim.study.executors import cores, run_all
 from lae_sim.study.plan import Plan, make_plan, tasks
-from lae_sim.study.records import Comparison, Failure, Record, Requirement, SummaryRow
+from lae_sim.study.records import MEAN, Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
 from lae_sim.study.store import Store
 from lae_sim.study.summary import (
@@ -99,6 +102,20 @@ class StudyResults:
 
         return pd.DataFrame(flat_rows(self.summary))
 
+    def scores_frame(self) -> DataFrame:
+        """The summary with all numbers as numbers.
+
+        World rates and scales are floats, and so is sigma, which is unknown where scores are means
+        over the grid of sigmas; ``over_sigmas`` says so.
+        """
+        table = self.summary_frame()
+        numbers = {
+            name: [float(Fraction(text)) for text in table[name]] for name in ("fps", "scale")
+        }
+        over = table["sigma"] == MEAN
+        sigma = [math.nan if text == MEAN else float(Fraction(text)) for text in table["sigma"]]
+        return table.assign(**numbers, sigma=sigma, over_sigmas=over)
+
     def __repr__(self) -> str:
         cells, failed = len(self.plan.cells), len(self.failures)
         more = f", {failed} of its parts failed" if failed else ""
@@ -131,15 +148,33 @@ class StudyResults:
         rankings = dict.fromkeys(rankings_of(self.scores).values())
         return [str(ranking) for ranking in rankings if ranking.reason]
 
+    def timing_sources(self) -> list[str]:
+        """Where the times of traces are from, as far as these say so."""
+        return self._of_traces(
+            (source.input.label, f"times: {source.metadata.timing_note}")
+            for source in self.plan.sources
+            if source.metadata.timing_note
+        )
+
     def search_sources(self) -> list[str]:
-        """What is known of the reach of the tracker of each trace, where something is modelled."""
-        sources = {
-            f"{scores.setting.trace.label}: modelled: {about['modelled']['source']}": None
+        """What is known of the reach of the trackers of traces, where something is modelled."""
+        return self._of_traces(
+            (scores.setting.trace.label, f"modelled: {about['modelled']['source']}")
             for scores in self.scores
             for about in scores.about
             if about["modelled"]
-        }
-        return list(sources)
+        )
+
+    def _of_traces(self, said: Iterable[tuple[str, str]]) -> list[str]:
+        """What is said of traces by their labels, each once, and of which of them."""
+        labels: dict[str, dict[str, None]] = {}
+        for label, text in said:
+            labels.setdefault(text, {})[label] = None
+        count = len(self.plan.sources)
+        return [
+            f"{'all traces' if len(some) == count > 1 else ', '.join(some)}: {text}"
+            for text, some in labels.items()
+        ]
 
     def notes(self) -> list[str]:
         """What keeps the figures from being what their names promise, each once."""
@@ -151,10 +186,7 @@ class StudyResults:
             for dataset, sequences in members.items()
             if len(sequences) > 1
         ]
-        for source in self.plan.sources:
-            if source.metadata.timing_note:
-                notes.append(f"{source.input.label}: times: {source.metadata.timing_note}")
-        notes += [*self.init_sources(assumed=True), *self.training]
+        notes += [*self.timing_sources(), *self.init_sources(assumed=True), *self.training]
         notes += self.search_sources()
         if any(scores.known is False for scores in self.scores):
             notes.append(
@@ -164,6 +196,12 @@ class StudyResults:
         notes += [
             note for scores in self.scores for about in scores.about for note in about["notes"]
         ]
+        notes += floor_notes(
+            row.trace + (f" x {row.scale}" if row.scale != 1 else "")
+            for row in self.summary
+            if row.sigma == 0 and row.staleness
+            if at_the_floor(row.skip_rate, row.staleness.mismatch_mean)
+        )
         for trace in self.traces:
             notes += [f"{trace['trace']}: {text}" for text in trace["warnings"]]
         return list(dict.fromkeys(notes))
@@ -228,14 +266,16 @@ def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathL
         LaeError: if it is, or if a folder stands where a file is to be, or a file for a folder.
     """
     written = [Path(folder, f"{name}.csv") for name in ("summary", "comparisons", "required")]
-    written += [Path(folder, "study.json"), Path(folder, "report.html")]
-    tables = Path(folder, "tables")
-    for path in (*written, *tables.glob("*.csv"), *tables.glob("*.tex")):
+    written += [Path(folder, name) for name in ("study.json", "report.html", "contents.json")]
+    folders = [Path(folder, name) for name in ("figures", "tables")]
+    inside = [path for each in folders for path in each.glob("*")]
+    for path in (*written, *(path for path in inside if path.suffix)):
         if path.exists() and not path.is_file():
             raise LaeError(f"{path}: is there already and is not a file: move it away")
-    if tables.exists() and not tables.is_dir():
-        raise LaeError(f"{tables}: is there already and is not a folder: move it away")
-    check_distinct([*written, *tables.glob("*")], inputs)
+    for each in folders:
+        if each.exists() and not each.is_dir():
+            raise LaeError(f"{each}: is there already and is not a folder: move it away")
+    check_distinct([*written, *inside], inputs)
 
 
 def _run(
