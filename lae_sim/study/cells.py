@@ -355,7 +355,7 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
     """
     name = setting.world.pre_forecaster
     searches = None if name is None else load_forecaster(name)
-    runs = setting.world.replay(trace, batch=True, pre_forecaster=searches)
+    runs = setting.world.replay(trace, pre_forecaster=searches)
     times = runs.source(next(iter(runs.times)))
     in_lanes = batchable([times], runs.policy) and runs.arrivals != "recorded"
     made: Iterable[tuple[int, Run]] = ((0, run) for run in runs)
