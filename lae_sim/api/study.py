@@ -29,6 +29,7 @@ def run_study(
     workers: int | None = None,
     scheduler: str | None = None,
     report: bool = True,
+    root: str | os.PathLike[str] | None = None,
     progress: ShowProgress = None,
     **keys: Any,
 ) -> StudyResults:
@@ -42,6 +43,8 @@ def run_study(
         workers: processes on this machine; by default one for each core. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead.
         report: whether to write ``report.html``, ``figures/`` and ``tables/`` too.
+        root: folder of the dataset, for the report to show a few sequences with their images;
+            synthetic ones need none.
         progress: whether to show a progress bar, by default on a terminal and in a notebook; or a
             function, which is told: ``progress(done, total, what)``.
         keys: keys of the study file (see :class:`Study`).
@@ -68,14 +71,19 @@ def run_study(
         workers = named("workers", partial(whole, least=1), workers)
         if scheduler is not None:
             raise LaeError("workers: for this machine: a scheduler says where to compute instead")
+    if root is not None and not isinstance(root, (str, os.PathLike)):
+        raise LaeError(f"root: a path, not {shown(root)}")
+    if root is not None and not Path(root).expanduser().exists():
+        raise LaeError(f"root: there is no {root}")
     made, base, kept = _asked_for(study, keys, folder)
-    with ProgressBar("study", "tasks", progress) as bar, looking_in(base or "."):
+    with looking_in(base or "."):
+        with ProgressBar("study", "tasks", progress) as bar:
 
-        def advance(what: str, done: int, total: int) -> None:
-            bar(done, total, what)
+            def advance(what: str, done: int, total: int) -> None:
+                bar(done, total, what)
 
-        results = compute_study(made, kept, base, workers, scheduler, advance)
-    write_views(results, report)
+            results = compute_study(made, kept, base, workers, scheduler, advance)
+        write_views(results, report, root)
     return results
 
 
@@ -101,14 +109,16 @@ def _asked_for(
     return read_study(path), path.parent, kept
 
 
-def write_views(results: StudyResults, report: bool = True) -> None:
+def write_views(
+    results: StudyResults, report: bool = True, root: str | os.PathLike[str] | None = None
+) -> None:
     """Write the report and what a paper needs beside a study's results, or take old ones away."""
     page = results.folder / "report.html"
     if report:
         view = View(results)
         frames = {"scores": view.results.scores_frame()}
         write_paper(Paper(study_in_columns(view), paper_tables(view), frames), results.folder)
-        write_report(view, page)
+        write_report(view, page, root)
         return
     remove_paper(results.folder)  # it would be of other results
     page.unlink(missing_ok=True)

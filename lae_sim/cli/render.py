@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import add_world, check_outputs, exit_status, new_parser, worlds_of
 from lae_sim.errors import LaeError, install
-from lae_sim.figures.film import Scene, writes_h264
+from lae_sim.figures.film import Scene, images_of, writes_h264
 from lae_sim.files import file_names
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.progress import tell
 
 if TYPE_CHECKING:
-    from lae_sim.datasets.frames import ImageSequence
     from lae_sim.replay.run import Run
     from lae_sim.trace.metadata import Metadata
 
@@ -94,7 +93,10 @@ def _render(arguments: argparse.Namespace) -> None:
     films = [out / name for name in file_names((run.recording.name for run in runs), ".mp4")]
     if out.is_dir():
         check_outputs(arguments, films)
-    sequences = {run.recording.name: _images(run, metadata, arguments) for run in runs}
+    sequences = {
+        run.recording.name: images_of(run.recording, metadata, arguments.root, arguments.dataset)
+        for run in runs
+    }
     camera = Camera(sequences, runs[0].schedule.clock.fps)
     forecasters = {name: load_forecaster(name, camera) for name in arguments.forecaster}
     if (folder or kind == ".mp4") and not writes_h264():
@@ -119,20 +121,6 @@ def _replayed(arguments: argparse.Namespace) -> tuple[Metadata, list[Run]]:
     (world,) = worlds_of(arguments)
     runs = world.replay(arguments.trace, arguments.sequence)
     return runs.trace.metadata, list(runs)
-
-
-def _images(run: Run, metadata: Metadata, arguments: argparse.Namespace) -> ImageSequence:
-    """The frames of a run's sequence."""
-    from lae_sim.datasets.layouts import find_dataset
-
-    name = arguments.dataset or (None if metadata.dataset == "unknown" else metadata.dataset)
-    if arguments.root is None and name is None:
-        raise LaeError("the trace does not say its dataset: give its folder with --root")
-    root = None if arguments.root is None else Path(arguments.root).expanduser()
-    box = run.recording.truth[0] if root is not None and root.is_file() else None
-    sequences = None if box is not None else [run.recording.name]
-    # the trace knows when its frames came
-    return find_dataset(name, root, sequences, box, frame_times="even").sequences[0]
 
 
 def _sheet(scene: Scene, frames: Sequence[int], path: Path) -> None:

@@ -20,6 +20,7 @@ EXAMPLES = f"""\
 examples:
   lae-sim study study.toml                                everything, on all cores of this machine
   lae-sim study study.toml --out figures --workers 2
+  lae-sim study study.toml --root ~/data/DTB70            frames in the report
   lae-sim study study.toml --scheduler tcp://head:8786    on a Dask cluster
   lae-sim study study.toml --json | jq '.summary[] | [.trace, .forecaster, .auc]'
 
@@ -68,6 +69,11 @@ def parser() -> argparse.ArgumentParser:
     add("--workers", type=argument(lambda text: whole(text, 1)), help="processes (default: cores)")
     add("--scheduler", metavar="ADDRESS", help="a Dask cluster to compute on, tcp://host:8786")
     add("--no-report", action="store_true", help="write no report, figures and tables")
+    add(
+        "--root",
+        metavar="PATH",
+        help="folder of the dataset, for the report to show a few sequences with their frames",
+    )
     add("--json", action="store_true", help="print what study.json holds instead of tables")
     return made
 
@@ -96,6 +102,7 @@ def _study(arguments: argparse.Namespace, failed: list[Failure]) -> None:
         workers=arguments.workers,
         scheduler=arguments.scheduler,
         report=not arguments.no_report,
+        root=arguments.root,
     )
     failed += results.failures
     if arguments.json:

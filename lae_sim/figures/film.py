@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from lae_sim.forecast.base import AnyFactory
     from lae_sim.replay.run import Run
     from lae_sim.trace.metadata import Metadata
+    from lae_sim.trace.recording import Recording
 
 WHITE, DARK = (255, 255, 255), (24, 24, 24)
 Colour = tuple[int, int, int]
@@ -142,6 +144,35 @@ def _line(items: Sequence[tuple[str, Colour]], width: int) -> Image:
         thick = max(round(1.5 * scale), 1)
         cv2.putText(band, text, place, font, scale, colour, thick, cv2.LINE_AA)
     return band
+
+
+def images_of(
+    recording: Recording,
+    metadata: Metadata,
+    root: str | os.PathLike[str] | None,
+    dataset: str | None = None,
+) -> ImageSequence:
+    """The images of a sequence of a trace.
+
+    Args:
+        recording: the sequence.
+        metadata: of its trace.
+        root: the dataset's folder, or a video; None of synthetic sequences.
+        dataset: its name, if it is not the one that the trace says.
+
+    Raises:
+        LaeError: if they cannot be found.
+    """
+    from lae_sim.datasets.layouts import find_dataset
+
+    name = dataset or (None if metadata.dataset == "unknown" else metadata.dataset)
+    if root is None and name is None:
+        raise LaeError("the trace does not say its dataset: give its folder with --root")
+    folder = None if root is None else Path(root).expanduser()
+    box = recording.truth[0] if folder is not None and folder.is_file() else None
+    sequences = None if box is not None else [recording.name]
+    # the trace knows when its frames came
+    return find_dataset(name, folder, sequences, box, frame_times="even").sequences[0]
 
 
 def writes_h264() -> bool:

@@ -299,23 +299,33 @@ def _draw_front(axes: Axes, view: View, points: Sequence[Point]) -> None:
 
 
 def _name_trackers(axes: Axes, view: View, points: Sequence[Point]) -> None:
-    """A label beside each tracker's best point, moved up where one is too near below."""
-    ordered = sorted(points, key=lambda point: point.auc)
-    best = {run_of(point.row): point for point in ordered}
+    """A label beside each tracker's best point; where there is no room, above and joined to it."""
+    best = {run_of(point.row): point for point in sorted(points, key=lambda point: point.auc)}
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    taken: list[tuple[float, float]] = []
+    inches = axes.bbox.width / axes.figure.dpi
+    letter, line = 0.055 * (right - left) / inches, 0.055 * (high - low)
+    taken: list[tuple[float, float, float]] = []
     for run, point in sorted(best.items(), key=lambda each: each[1].auc):  # the worst first
-        x, y, least = point.ms, point.auc, 0.055 * (high - low)
-        for other, height in taken:
-            if abs(other - x) < 0.4 * (right - left):
-                y = max(y, height + least)
-        taken.append((x, y))
-        aside: dict[str, Any] = {"xytext": (8, 0), "ha": "left"}
-        if x > (left + right) / 2:
-            aside = {"xytext": (-8, 0), "ha": "right"}
-        label = {"textcoords": "offset points", "va": "center", "fontsize": 8, **aside}
-        axes.annotate(_short(view.names[run]), (x, y), **label)
-    axes.set_ylim(low, max(high, *(y + 0.05 * (high - low) for _, y in taken)))
+        name, x, y = _short(view.names[run]), point.ms, point.auc
+        is_left = x > (left + right) / 2
+        length = letter * (len(name) + 3)
+        start, stop = (x - length, x) if is_left else (x, x + length)
+        for begin, end, height in sorted(taken, key=lambda label: label[2]):
+            if begin < stop and start < end and abs(height - y) < line:
+                y = height + line
+        taken.append((start, stop, y))
+        if y > point.auc:
+            axes.plot([x, x], [point.auc, y], color=GREY, linewidth=0.5, zorder=1)
+        axes.annotate(
+            name,
+            (x, y),
+            (-8 if is_left else 8, 0) if y == point.auc else (-2 if is_left else 2, 0),
+            textcoords="offset points",
+            ha="right" if is_left else "left",
+            va="center",
+            fontsize=8,
+        )
+    axes.set_ylim(low, max(high, *(y + line for *_, y in taken)))
 
 
 def gains(view: View) -> Picture | None:

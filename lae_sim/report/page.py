@@ -1,8 +1,8 @@
 """The report of a study: one HTML page that needs nothing else.
 
-Pictures are SVG files within the page, as images, so that nothing in them is looked up or run. The
-template escapes all text, and the page's own policy lets no script run but the one that sorts
-tables.
+It can be read without its script, which sorts tables, chooses their columns, saves figures and
+moves through sequences. The template escapes all text, and the page's own policy lets no other
+script run and nothing be fetched.
 """
 
 from __future__ import annotations
@@ -11,17 +11,20 @@ import base64
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
-from lae_sim.errors import visible
+from lae_sim.errors import listed, visible
 from lae_sim.evaluation.metrics import CONVENTIONS, Convention
 from lae_sim.figures import study as study_figures
 from lae_sim.figures.study import SWEEPS, Picture
+from lae_sim.figures.style import BLUE, VERMILION
 from lae_sim.files import written_whole
 from lae_sim.report import study_tables
+from lae_sim.report.closeup import CloseUp, close_ups
+from lae_sim.report.inline import dark_colours, inlined, variable
 from lae_sim.report.table import COUNT, PERCENT, Column, Number, Table
 from lae_sim.study.verdict import shortfalls
 from lae_sim.study.view import View
@@ -29,8 +32,8 @@ from lae_sim.study.view import View
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
 
-STALLS = 5
-"""Stalls that are listed of each trace."""
+STALLS, MOST_NAMES = 5, 3
+"""Stalls that are listed of each trace, and traces that are named for what they share."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ class Section:
         meanings: those of the table's columns.
         pictures: before the table.
         table: can be sorted.
+        close_ups: sequences frame by frame.
         entries: things that can be unfolded.
     """
 
@@ -70,6 +74,7 @@ class Section:
     meanings: Mapping[str, str] = field(default_factory=dict)
     pictures: Sequence[Picture] = ()
     table: Table | None = None
+    close_ups: Sequence[CloseUp] = ()
     entries: Sequence[Entry] = ()
 
     @property
@@ -78,12 +83,18 @@ class Section:
         return not any(getattr(self, each.name) for each in fields(self)[2:])
 
 
-def write_report(results: StudyResults | View, path: str | os.PathLike[str]) -> None:
+def write_report(
+    results: StudyResults | View,
+    path: str | os.PathLike[str],
+    root: str | os.PathLike[str] | None = None,
+) -> None:
     """Write the report.
 
     Args:
         results: of a study, or a view of them; the same ones give the same bytes.
         path: of the page.
+        root: folder of the dataset, whose images a few sequences are shown with; synthetic ones
+            need none.
 
     Raises:
         LaeError: if the file cannot be written.
@@ -101,11 +112,11 @@ def write_report(results: StudyResults | View, path: str | os.PathLike[str]) -> 
     """
     with written_whole(path) as temporary:
         view = results if isinstance(results, View) else View(results)
-        temporary.write_text(page(view), "utf-8", "backslashreplace")
+        temporary.write_text(page(view, root), "utf-8", "backslashreplace")
 
 
-def page(view: View) -> str:
-    """The report's HTML."""
+def page(view: View, root: str | os.PathLike[str] | None = None) -> str:
+    """The report's HTML (see :func:`write_report`)."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -117,18 +128,32 @@ def page(view: View) -> str:
     )
     environment.filters |= {
         "visible": visible,
+        "inlined": inlined,
+        "variable": variable,
         "base64": lambda data: base64.b64encode(data).decode(),
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),
     }
     datasets = dict.fromkeys(visible(row.dataset) for row in view.results.summary)
+    sections = [section for section in _sections(view, root) if not section.is_empty]
     return environment.get_template("page.html").render(
         title=f"Latency-aware study: {', '.join(datasets)}",
         conclusion=view.results.verdict(),
         facts=_facts(view),
-        sections=[section for section in _sections(view) if not section.is_empty],
+        sections=sections,
         style=page_file("page.css"),
+        dark=page_file("dark.css") + _dark_figures(sections),
         script=page_file("page.js"),
     )
+
+
+def _dark_figures(sections: Iterable[Section]) -> str:
+    """The rule of CSS that makes the colours of figures those of a dark page."""
+    pictures = (picture.svg.decode() for section in sections for picture in section.pictures)
+    colours = (
+        " ".join(each.colours.values()) for section in sections for each in section.close_ups
+    )
+    variables = {**dark_colours([BLUE, VERMILION]), **dark_colours([*pictures, *colours])}
+    return f":root {{ {'; '.join(f'{name}: {colour}' for name, colour in variables.items())} }}"
 
 
 def page_file(name: str) -> str:
@@ -171,10 +196,15 @@ def _search_facts(results: StudyResults) -> dict[str, str]:
     """What modelled scores rest on, and by what is ranked; empty where nothing is modelled."""
     if not (sources := results.search_sources()):
         return {}
-    return {"search model": "; ".join(sources), "ranking": "; ".join(results.ranked_by())}
+    traces: dict[str, list[str]] = {}
+    for source in sources:
+        trace, _, what = source.partition(": ")
+        traces.setdefault(what, []).append(trace)
+    said = [f"{listed(some, MOST_NAMES)}: {what}" for what, some in traces.items()]
+    return {"search model": "; ".join(said), "ranking": "; ".join(results.ranked_by())}
 
 
-def _sections(view: View) -> Iterator[Section]:
+def _sections(view: View, root: str | os.PathLike[str] | None) -> Iterator[Section]:
     results = view.results
     failures = [f"{failure.of}: {failure.reason}" for failure in results.failures]
     yield Section("failures", "Failures", texts=failures)
@@ -188,6 +218,8 @@ def _sections(view: View) -> Iterator[Section]:
     front = _drawn(study_figures.front(view))
     yield Section("front", "Accuracy against time", pictures=front)
     yield Section("gains", "What forecasters win", pictures=_drawn(study_figures.gains(view)))
+    sequences, texts = close_ups(view, root)
+    yield Section("sequences", "Frame by frame", texts=texts, close_ups=sequences)
     if attributes := study_tables.attribute_table(view):
         pictures = [*study_figures.attributes(view)]
         yield Section("attributes", "Attributes", pictures=pictures, table=attributes)

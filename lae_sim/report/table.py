@@ -189,6 +189,19 @@ class Table:
         return replace(self, columns=tuple(self.columns[place] for place in kept), rows=rows)
 
     @property
+    def minor(self) -> set[int]:
+        """The places of columns that need not be seen: unimportant, or of one label alone."""
+        return {
+            place
+            for place, column in enumerate(self.columns)
+            if column.importance < 4
+            or (place and column.is_label and len(self.rows) > 1 and self._is_constant(place))
+        }
+
+    def _is_constant(self, place: int) -> bool:
+        return len({row[place].text for row in self.rows}) == 1
+
+    @property
     def groups(self) -> list[tuple[str, int]]:
         """Headings above the other columns, each with the number of its columns."""
         titles = [column.group for column in self.columns if column.group]

@@ -6,13 +6,18 @@ import json
 import shutil
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pandas as pd
 import pytest
 from nasty import nasty_traces
 from places import TRACES
 
 import lae_sim
+from lae_sim.cli.study import main
+from lae_sim.errors import LaeError
 
 SLOW, FAST = TRACES / "synthetic-slow.parquet", TRACES / "synthetic-fast.parquet"
 TOML = """
@@ -129,3 +134,55 @@ def test_a_progress_bar(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     done, total, what = told[-1]
     assert (done, what) == (total, "summing up")
     assert [each[:2] for each in told[:-1]] == [(k, total) for k in range(1, total + 1)]
+
+
+OWN = """
+class Ahead:
+    def __init__(self, box, image_size=None):
+        self.box = box
+    def update(self, frame, box):
+        self.box = box
+    def predict(self, frame):
+        return self.box
+
+def latest(clock, calls):
+    last, _, now = calls[-1]
+    frame = max(last + 1, clock.newest(now))
+    return frame, max(now, clock.arrival(frame))
+"""
+
+
+def test_the_report_shows_frames_and_knows_what_lies_beside_the_study(tmp_path: Path) -> None:
+    (tmp_path / "study_of_own.py").write_text(OWN)
+    truth = np.array([[5 + frame, 10, 12, 8] for frame in range(20)], float)
+    for folder in ("data/walk/img", "elsewhere"):
+        (tmp_path / folder).mkdir(parents=True)
+    for frame in range(20):
+        image = np.full((40, 64, 3), 10 * frame, np.uint8)
+        cv2.imwrite(str(tmp_path / f"data/walk/img/{frame + 1:05d}.jpg"), image)
+    np.savetxt(tmp_path / "data/walk/groundtruth_rect.txt", truth, "%g", ",")
+    recording = lae_sim.Recording.new("walk", truth, truth, [50_000_000] * 20)
+    metadata = lae_sim.Metadata.new(30, "every-frame", dataset={"name": "walks"})
+    lae_sim.write_trace(lae_sim.Trace(metadata, [recording]), tmp_path / "walk.parquet")
+    study = tmp_path / "study.toml"
+    study.write_text(
+        'traces = "walk.parquet"\nforecasters = ["hold", "study_of_own:Ahead"]\n'
+        'policies = ["study_of_own:latest"]\nsearch = "off"\n'
+    )
+    results = lae_sim.run_study(study, tmp_path / "out", workers=1, root=tmp_path / "data")
+    assert not results.failures
+    text = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "those from 0 to 19" in text
+    assert text.count('href="data:image/jpeg;base64,') == 1
+    lae_sim.write_report(results, tmp_path / "bare.html")
+    bare = (tmp_path / "bare.html").read_text("utf-8")
+    assert "without frames" in bare
+    assert "image/jpeg" not in bare.partition("<script>")[0]
+    assert main(f"{study} --out {tmp_path / 'out'} --root {tmp_path / 'none'}".split()) == 2
+
+
+@pytest.mark.parametrize(("root", "told"), [(3, "root: a path"), ("none", "root: there is no")])
+def test_a_root_that_is_none(root: Any, told: str, tmp_path: Path) -> None:
+    with pytest.raises(LaeError, match=told):
+        lae_sim.run_study(traces=SLOW, folder=tmp_path / "out", root=root)
+    assert not (tmp_path / "out").exists()
