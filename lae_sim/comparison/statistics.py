@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -123,9 +123,11 @@ class Bootstrap:
         ]
         return np.concatenate(blocks, axis=1)
 
-    def interval(self, samples: Floats) -> Interval:
-        """The range between the tails of samples."""
-        return Interval(*quantiles(samples, self.tails))
+    def interval(
+        self, samples: Floats, middle: float | None = None, spread: float = 0.0
+    ) -> Interval:
+        """The range between the tails of samples (see :func:`quantiles`)."""
+        return Interval(*quantiles(samples, self.tails, middle, spread))
 
     def compare(
         self, values: Floats, baseline: Floats | float, means: Floats, others: Floats | float
@@ -156,17 +158,46 @@ class Bootstrap:
         return Recovered(recovered(won, lost), shares)
 
 
-def quantiles(values: Floats, at: Sequence[float]) -> list[float]:
-    """What ``numpy.quantile`` gives of values [N] without NaN, to the bit, in half its time."""
+def quantiles(
+    values: Floats, at: tuple[float, float], middle: float | None = None, spread: float = 0.0
+) -> tuple[float, float]:
+    """What ``numpy.quantile`` gives of values [N] without NaN, to the bit, in a part of its time.
+
+    Args:
+        values: float64 [N].
+        at: of two quantiles the lower and the upper.
+        middle, spread: mean and standard deviation, perhaps rough; the nearer, the faster.
+    """
     places = [(len(values) - 1) * q for q in at]
-    ends = [(math.floor(place), min(math.floor(place) + 1, len(values) - 1)) for place in places]
-    ordered = np.partition(values, sorted({*chain.from_iterable(ends)}))
-    found = []
-    for place, (low, high) in zip(places, ends):
-        below, above, part = float(ordered[low]), float(ordered[high]), place - low
-        step = above - below
-        found.append(below + step * part if part < 0.5 else above - step * (1 - part))
-    return found
+    low, high = math.floor(places[0]), math.floor(places[1])
+    if middle is None:
+        middle, spread = float(values.mean()), float(values.std())
+    # some of the lowest and of the highest are most often enough, and sorting these is fast
+    lowest = values[values < middle - _tail(at[0]) * spread]
+    highest = values[values > middle + _tail(1 - at[1]) * spread]
+    left_out = len(values) - len(highest)
+    if low + 1 < len(lowest) and high >= left_out:
+        lowest.sort()
+        highest.sort()
+    else:
+        lowest = highest = np.sort(values)
+        left_out = 0
+    last = len(values) - 1
+    lower = _between(lowest[low], lowest[min(low + 1, last)], places[0] - low)
+    upper = highest[high - left_out], highest[min(high + 1, last) - left_out]
+    return lower, _between(*upper, places[1] - high)
+
+
+def _tail(share: float) -> float:
+    """Beyond how many standard deviations twice so large a share of normal values lies."""
+    return NormalDist().inv_cdf(1 - min(2 * share, 0.5)) if share > 0 else 0.0
+
+
+def _between(below: float, above: float, part: float) -> float:
+    """A point on the way from one value to the next, in NumPy's order of operations."""
+    below, above = float(below), float(above)
+    step = above - below
+    return below + step * part if part < 0.5 else above - step * (1 - part)
 
 
 def holm(ps: Sequence[float]) -> list[float]:

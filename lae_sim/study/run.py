@@ -17,26 +17,34 @@ from lae_sim.errors import LaeError
 from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
-from lae_sim.study.cells import Task
-from lae_sim.study.deployment import Curve, requirement, searches
-from lae_sim.study.executors import cores, run_all
+from lae_sim.study.cells import Result, Task
+from lae_sim.study.comparisons import PairsFile, Rivals, rivals_of
+from lae_sim.study.deployment import Curve, Search, requirement, searches
+from lae_sim.study.executors import RunAll, at_work, cores, run_here
+from lae_sim.study.pairs import Pairs
 from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
 from lae_sim.study.store import Store
 from lae_sim.study.summary import (
     Scores,
-    compare_traces,
     rankings_of,
     read_scores,
     summarise_study,
 )
 from lae_sim.study.verdict import verdict
-from lae_sim.study.work import Description, Work, attempt
+from lae_sim.study.work import Batch, Description, Done, Work, attempt, attempt_batch, batches
 from lae_sim.trace.describe import is_measured
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+
+PAIRS = "comparisons.parquet"
+"""The file of all pairs of traces."""
+
+FEW = 30_000
+"""Pairs, counted twice, that are sooner compared here than handed to workers."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -48,7 +56,9 @@ class StudyResults:
         plan: what was computed.
         scores: of every finished trace, setting, convention and forecaster.
         summary: means (see :func:`lae_sim.study.summary.summarise_study`).
-        comparisons: pairs of traces (see :func:`lae_sim.study.summary.compare_traces`).
+        comparisons: pairs of traces, those of each setting with its best if there are too many to
+            hold (see :data:`lae_sim.study.comparisons.MOST`): all are in ``comparisons.parquet``.
+        pairs: how many there are in all.
         required: what a required AUC asks for (see :func:`lae_sim.study.deployment.requirement`).
         traces: what ``lae-sim show --json`` says of each trace, as it says it.
         computed: how many cells were computed now, and not found finished.
@@ -79,6 +89,7 @@ class StudyResults:
     scores: tuple[Scores, ...]
     summary: tuple[SummaryRow, ...]
     comparisons: tuple[Comparison, ...]
+    pairs: int
     required: tuple[Requirement, ...]
     traces: tuple[dict[str, Any], ...]
     computed: int
@@ -87,11 +98,12 @@ class StudyResults:
 
     def to_frame(self) -> DataFrame:
         """Every score of every sequence, repetition and sigma (see :mod:`lae_sim.study.rows`)."""
-        import pandas as pd
+        import pyarrow as pa
 
         store = Store(self.folder)
-        files = [store.rows(cell) for cell in self.plan.cells if store.has(cell)]
-        return pd.concat(map(pd.read_parquet, files), ignore_index=True)
+        store.open()
+        tables = [store.rows(cell) for cell in self.plan.cells if store.has(cell)]
+        return pa.concat_tables(tables).to_pandas()
 
     def summary_frame(self) -> DataFrame:
         """The summary as a table: the columns of ``summary.csv``."""
@@ -228,7 +240,7 @@ def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathL
         LaeError: if it is, or if a folder stands where a file is to be, or a file for a folder.
     """
     written = [Path(folder, f"{name}.csv") for name in ("summary", "comparisons", "required")]
-    written += [Path(folder, "study.json"), Path(folder, "report.html")]
+    written += [Path(folder, name) for name in ("study.json", "report.html", PAIRS)]
     tables = Path(folder, "tables")
     for path in (*written, *tables.glob("*.csv"), *tables.glob("*.tex")):
         if path.exists() and not path.is_file():
@@ -258,47 +270,100 @@ def _run(
         *tasks(cells, factories),
         *(replace(search, factory=factories[search.cell.forecaster]) for search in sought),
     ]
-    failures, computed = [], 0
-    workers = min(workers or cores(), max(len(works), 1))
+    pieces = [*batches(works, {source.input: source.frames for source in plan.sources})]
+    failures: list[Failure] = []
+    computed = 0
     # closed whatever happens here, or workers would outlive the study
-    with closing(run_all(attempt, works, workers, scheduler)) as attempts:
-        for done, (work, result) in enumerate(attempts, 1):
-            progress("", done, len(works))
-            if isinstance(result, Failure):
-                failures.append(result)
-            elif isinstance(work, Task):
-                for of_cell in result:
-                    if isinstance(of_cell, Failure):
-                        failures.append(of_cell)
-                    else:
-                        store.put(of_cell)
-                        computed += 1
-            else:
-                store.keep(work.key, result)
-    progress("summing up", len(works), len(works))
-    scores = tuple(read_scores(plan, store))
-    if not scores:
-        raise LaeError(f"nothing could be computed: {failures[0].reason}")
+    with at_work(min(workers or cores(), max(len(pieces), 1)), scheduler) as run:
+        with closing(run(attempt_batch, pieces)) as attempts:
+            for done, (batch, result) in enumerate(attempts, 1):
+                progress("", done, len(pieces))
+                computed += _keep(batch, result, store, failures)
+        progress("reading", len(pieces), len(pieces))
+        scores = tuple(read_scores(plan, store))
+        if not scores:
+            raise LaeError(f"nothing could be computed: {failures[0].reason}")
+        compared = _compare(scores, study.seed, store, run, failures, progress)
+    progress("summing up", 1, 1)
     answers = ((search, store.document(search.key)) for search in asked)
     results = StudyResults(
         folder=store.folder,
         plan=plan,
         scores=scores,
         summary=tuple(summarise_study(scores, study.seed)),
-        comparisons=tuple(compare_traces(scores, study.seed)),
+        comparisons=compared[0],
+        pairs=compared[1],
         required=tuple(
             requirement(search, Curve(**answer), auc)
             for search, answer in answers
             if answer
             for auc in search.required
         ),
-        traces=tuple(filter(None, (store.document(each.key) for each in described))),
+        traces=tuple(
+            dict(trace)
+            for trace in (store.document(each.key) for each in described)
+            if trace is not None
+        ),
         computed=computed,
         failures=tuple(sorted(failures, key=lambda failure: str(failure.flat()))),
         training=tuple(training),
     )
     _write(results)
     return results
+
+
+def _keep(batch: Batch, done: Done, store: Store, failures: list[Failure]) -> int:
+    """Keep what came of a batch; how many cells were computed."""
+    results: list[Result] = []
+    documents = {}
+    for work, found in zip(batch.works, done.found):
+        if isinstance(found, Failure):
+            failures.append(found)
+        elif isinstance(work, Task):
+            failures += [each for each in found if isinstance(each, Failure)]
+            results += [each for each in found if isinstance(each, Result)]
+        elif isinstance(work, (Description, Search)):
+            documents[work.key] = found
+    store.put(results, documents, done.rows)
+    return len(results)
+
+
+def _compare(
+    scores: Sequence[Scores],
+    seed: int,
+    store: Store,
+    run: RunAll,
+    failures: list[Failure],
+    progress: Callable[[str, int, int], object],
+) -> tuple[tuple[Comparison, ...], int]:
+    """The pairs that are held (see :data:`.comparisons.MOST`), and how many there are in all.
+
+    They are computed on the workers, but for a few, and kept in the file of all pairs.
+    """
+    rivals = rivals_of(scores, rankings_of(scores), seed)
+    pairs = PairsFile(store.folder / PAIRS, store.document("pairs"))
+    if not rivals:
+        pairs.path.unlink(missing_ok=True)
+        return (), 0
+    missing = [each for each in rivals if each.key not in pairs.places]
+    if missing or [each.key for each in rivals] != list(pairs.places):
+        few = sum(len(each.members) ** 2 for each in missing) < FEW
+        with closing((run_here if few else run)(attempt, missing)) as attempts:
+            early: dict[str, Pairs | None] = {}  # before their turn
+
+            def found(wanted: Rivals) -> Pairs | None:
+                """The pairs of some rivals, when their turn has come; None of what failed."""
+                while wanted.key not in early:
+                    each, result = next(attempts)
+                    progress("pairs", 0, 1)
+                    is_failure = isinstance(result, Failure)
+                    failures.extend([result] if is_failure else [])
+                    early[each.key] = None if is_failure else result
+                return early.pop(wanted.key)
+
+            pairs.write(rivals, found)
+        store.keep("pairs", pairs.document())
+    return tuple(pairs.records(rivals)), pairs.total
 
 
 def _factories(
