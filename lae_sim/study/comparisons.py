@@ -217,15 +217,15 @@ class PairsFile:
                 self._read = place.group, file.read_row_group(place.group)
         return self._read[1].slice(place.first, place.count)
 
-    def records(self, rivals: Iterable[Rivals], most: int = MOST) -> Iterator[Comparison]:
+    def records(self, rivals: Iterable[Rivals]) -> Iterator[Comparison]:
         """The pairs as records, in the order of the rivals.
 
-        If there are more than ``most``, of each setting those with its best trace.
+        If there are more than :data:`MOST`, of each setting those with its best trace.
         """
         for each in rivals:
             if each.key not in self.places:
                 continue
-            table, best = self.rows(each.key), each.best if self.total > most else None
+            table, best = self.rows(each.key), each.best if self.total > MOST else None
             if best is not None:
                 names = zip(*(table.column(side).to_pylist() for side in "ab"))
                 table = table.take([row for row, pair in enumerate(names) if best in pair])

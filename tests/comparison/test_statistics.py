@@ -408,7 +408,13 @@ def test_rows_of_differences_have_the_p_that_each_has_alone():
 def test_quantiles_are_those_of_numpy_to_the_bit():
     rng = np.random.default_rng(6)
     for size in (1, 2, 3, 41, 450, 10_000):
-        for decimals in (1, 3, 17):
-            values = np.round(rng.normal(size=size), decimals)
-            at = (0, 0.025, 0.3, 0.5, 0.975, 1)
-            assert quantiles(values, at) == np.quantile(values, at).tolist()
+        for values in (
+            *(np.round(rng.normal(size=size), decimals) for decimals in (0, 3, 17)),
+            rng.lognormal(0, 2, size),
+            -rng.lognormal(0, 2, size),
+            np.zeros(size),
+        ):
+            for at in ((0.025, 0.975), (0, 1), (0.3, 0.5), (0.49, 0.98), (0.005, 0.995)):
+                expected = tuple(np.quantile(values, at).tolist())
+                assert quantiles(values, at) == expected
+                assert quantiles(values, at, -0.3, 0.5) == expected  # whatever is guessed
