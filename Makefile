@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench samples clean
+.PHONY: demo test lint docs pages bench samples clean
 
 demo: $(VENV)/.demo  ## replay the sample traces
 	$(BIN)/lae-sim replay traces/synthetic-slow.parquet traces/synthetic-fast.parquet
@@ -16,6 +16,12 @@ lint: $(VENV)/.dev  ## format, lint, types and the order of imports
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(VENV)/.docs  ## build the site of docs/ in site/; warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+pages: $(VENV)/.test  ## write the outputs that README.md and docs/ show anew
+	$(BIN)/python tests/pages.py
 
 bench: $(VENV)/.test  ## measure speed and memory
 	$(BIN)/python benchmarks/run.py
@@ -36,6 +42,6 @@ $(VENV)/.demo: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
-$(VENV)/.test $(VENV)/.dev: $(VENV)/.%: $(BIN)/python pyproject.toml
+$(VENV)/.test $(VENV)/.dev $(VENV)/.docs: $(VENV)/.%: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$*]'
 	touch $@

@@ -1,7 +1,7 @@
 r"""What forecasters win back, and where: ``benchmarks/forecasters.py TRACE ... --section NAME``.
 
-Each section of :data:`SECTIONS` is a table of ``docs/results/forecasters.md``; the first, shares,
-is that of the README. Traces are of every frame; the sections camera and closed-loop need frames
+Each section of :data:`SECTIONS` is a table of ``docs/results/forecasters.md``; the README quotes
+the first, shares. Traces are of every frame; the sections camera and closed-loop need frames
 too, of the sequences that they are about::
 
     python benchmarks/forecasters.py TRACE ... --section camera --frames FOLDER

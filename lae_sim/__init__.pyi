@@ -9,6 +9,7 @@ from .errors import LaeError, TraceError
 from .evaluation.evaluate import evaluate_runs
 from .evaluation.events import event_log
 from .evaluation.metrics import CONVENTIONS
+from .figures.film import Scene
 from .forecast.base import Forecaster, Hold
 from .forecast.kalman import Kalman
 from .importers.convert import convert_results
@@ -18,7 +19,6 @@ from .recipes.catalogue import list_recipes
 from .recipes.make import get_trace
 from .replay.run import Run, Runs, replay_sequence
 from .replay.world import SIGMA_GRID, World, replay_trace
-from .report.film import Scene
 from .report.page import write_report
 from .report.study_tables import write_tables
 from .study.run import StudyResults

@@ -30,15 +30,23 @@ def run_process(*arguments: object, cwd: Path | None = None) -> subprocess.Compl
     )
 
 
-def run_here(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def run_here(
+    *arguments: object, cwd: Path | None = None, both: bool = False
+) -> subprocess.CompletedProcess[str]:
     """Run the same in this process, which has imported everything already.
 
     Modules of ``cwd`` are imported anew, and forgotten, so that another folder may have their like.
+
+    Args:
+        arguments: what follows ``lae-sim``.
+        cwd: where it runs.
+        both: whether both streams are printed to the one, as to a terminal.
     """
     words = [str(argument) for argument in arguments]
-    printed, complaint = io.StringIO(), io.StringIO()
+    printed = io.StringIO()
+    complaint = printed if both else io.StringIO()
     streams = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complaint)
-    with _in_folder(cwd or Path.cwd()), streams[0], streams[1]:
+    with in_folder(cwd or Path.cwd()), streams[0], streams[1]:
         try:
             status = main(words)
         except SystemExit as end:  # by argparse
@@ -47,7 +55,8 @@ def run_here(*arguments: object, cwd: Path | None = None) -> subprocess.Complete
 
 
 @contextlib.contextmanager
-def _in_folder(folder: Path) -> Iterator[None]:
+def in_folder(folder: Path) -> Iterator[None]:
+    """Work in a folder, whose modules may be imported meanwhile."""
     before, path = Path.cwd(), list(sys.path)
     _forget(folder)  # what another test's folder had under the same name
     os.chdir(folder)

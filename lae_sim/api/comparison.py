@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+    from lae_sim.figures.column import ColumnFigure
     from lae_sim.trace.file import Trace
 
 
@@ -158,9 +159,53 @@ class ComparisonResult:
 
     def plot(self) -> Figure:
         """The mean of each forecaster with its interval, and the share recovered beside it."""
-        from lae_sim.report.forecaster_figures import overview
+        from lae_sim.figures.forecasters import overview
 
         return overview(self.summary, self.metrics[0])
+
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        documents: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        """Write what a paper needs: figures and tables (see :mod:`lae_sim.report.paper`).
+
+        Args:
+            folder: where to; made if it is not there.
+            documents: JSON objects to write there too, by the name of their file.
+
+        Raises:
+            LaeError: if a file cannot be written.
+        """
+        from lae_sim.report.comparison import paper_tables
+        from lae_sim.report.paper import Paper, write_paper
+
+        metadata = {name: trace.metadata for name, trace in self.traces.items()}
+        attributes = self.attributes if self._names_attributes else None
+        tables = paper_tables(self.summary, self.metrics, metadata, attributes)
+        frames = {"scores": self.summary, "sequences": self.scores}
+        write_paper(Paper(self._figures(), tables, frames, documents or {}), folder)
+
+    @property
+    def _names_attributes(self) -> bool:
+        return any(trace.metadata.names_attributes for trace in self.traces.values())
+
+    def _figures(self) -> Iterator[ColumnFigure]:
+        from lae_sim.figures.forecasters import (
+            attributes_in_columns,
+            comparison_in_columns,
+            sweeps_in_columns,
+        )
+
+        yield from comparison_in_columns(self.summary, self.metrics[:2])
+        if self.whole_grid:  # over which the summary has means
+            metrics = ("auc", "dp20")
+            by_sigma = summarise(self.scores, metrics=metrics, resamples=1, seed=self.seed)
+            yield from sweeps_in_columns(by_sigma, metrics)
+        else:
+            yield from sweeps_in_columns(self.summary, self.metrics[:2])
+        if self._names_attributes:
+            yield from attributes_in_columns(self.attributes, self.metrics[0])
 
     def __str__(self) -> str:
         from lae_sim.report.comparison import comparison_table
@@ -168,7 +213,8 @@ class ComparisonResult:
         return "\n\n".join([comparison_table(self.summary), *self.notes])
 
     def __repr__(self) -> str:
-        from lae_sim.report.table import FINE_SCORE, METRIC_LABELS
+        from lae_sim.figures.labels import METRIC_LABELS
+        from lae_sim.report.table import FINE_SCORE
 
         table = self.summary[self.summary["metric"] == self.metrics[0]]
         first = table.drop_duplicates("forecaster")

@@ -26,7 +26,7 @@ from lae_sim.api.inputs import (
 )
 from lae_sim.boxes import iou
 from lae_sim.engine.clock import Number, exact
-from lae_sim.engine.scheduler import Policy
+from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError, hint, listed, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
@@ -42,7 +42,7 @@ from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.world import TraceLike, World, label_of, named, open_others, open_trace
-from lae_sim.report.replay import SequenceRows, attribute_members, trace_report
+from lae_sim.report.replay import SequenceRows, attribute_members, paper_tables, trace_report
 from lae_sim.report.table import FINE_SCORE
 from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
@@ -50,6 +50,10 @@ from lae_sim.trace.file import Trace
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+    from lae_sim._arrays import Floats
+    from lae_sim.figures.column import ColumnFigure
+    from lae_sim.figures.lines import Panel
 
 
 @dataclass(frozen=True, eq=False)
@@ -402,6 +406,25 @@ class EvaluationResult:
         """Success and precision of all traces, or of a sweep how AUC and DP change over it."""
         return plot_evaluations(self.parts)
 
+    def write(self, folder: str | os.PathLike[str]) -> None:
+        """Write what a paper needs: figures and tables (see :mod:`lae_sim.report.paper`).
+
+        Raises:
+            LaeError: if a file cannot be written.
+        """
+        from lae_sim.report.paper import Paper, write_paper
+
+        document = self.document(attributes=True)
+        write_paper(
+            Paper(
+                figures_for_paper(self.parts),
+                paper_tables(document["traces"], [part.scenario.label for part in self.parts]),
+                {"scores": self.summary, "sequences": self.to_frame()},
+                {"replay.json": document},
+            ),
+            folder,
+        )
+
     def document(self, attributes: bool = False, per_sequence: bool = False) -> dict[str, Any]:
         """All of it as one JSON object, as ``lae-sim replay --json`` prints it."""
         from lae_sim import __version__
@@ -496,6 +519,60 @@ def _exactness(part: Evaluated) -> list[str]:
     ]
 
 
+@dataclass(frozen=True)
+class _Plotted:
+    """What figures of evaluations show.
+
+    Attributes:
+        at: the permitted latency of a sweep's scores.
+        runs: what tells the parts apart, but for what is swept: one tuple a part.
+        several: the names of what is in these tuples.
+        swept: ``fps`` and ``latency_scale``, as far as they vary.
+        setting: what all have in common, in words.
+    """
+
+    at: Fraction
+    runs: Sequence[tuple[str, ...]]
+    several: Sequence[str]
+    swept: Sequence[str]
+    setting: str
+
+    @classmethod
+    def of(cls, parts: Sequence[Evaluated], sigma: Fraction | None) -> _Plotted:
+        from lae_sim.report.export import sigma_text
+
+        first = parts[0].scenario
+        at = first.world.sigmas[0] if sigma is None else sigma
+        settings = [_setting(part.scenario) for part in parts]
+        several = [
+            name
+            for name in ("trace", "policy", "latency")
+            if len({setting[name] for setting in settings}) > 1
+        ]
+        setting = "" if "trace" in several else f"{first.label}: "
+        setting += f"sigma {sigma_text(at)}, convention {first.world.convention}"
+        runs = [tuple(setting[name] for name in several) for setting in settings]
+        swept = [
+            key
+            for key, name in (("fps", "fps"), ("latency_scale", "scale"))
+            if len({(run, each[name]) for run, each in zip(runs, settings)}) > len(set(runs))
+        ]
+        return cls(at, runs, several, swept, setting)
+
+    def curves(self, parts: Sequence[Evaluated]) -> dict[str, tuple[Floats, Floats]]:
+        """Success and precision by name (see :func:`.figures.replay.success_and_precision`)."""
+        from lae_sim.figures.replay import mean_curves
+
+        curves = {}
+        for part, run in zip(parts, self.runs):
+            if "trace" in self.several:
+                run = (str(Path(run[0]).with_suffix("")), *run[1:])
+            prefix = f"{', '.join(run)}: " if run else ""
+            found = mean_curves(part.totals.curves, list(part.scenario.forecasters))
+            curves.update({prefix + name: curve for name, curve in found.items()})
+        return curves
+
+
 def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) -> Figure:
     """Success and precision of evaluations, or of a sweep how AUC and DP change over it.
 
@@ -504,37 +581,61 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
         sigma: the permitted latency of a sweep's scores; the first by default. Success and
             precision are at the first in any case.
     """
-    from lae_sim.report import figures
-    from lae_sim.report.export import sigma_text
+    from lae_sim.figures.replay import success_and_precision, sweep_figure
 
-    first = parts[0].scenario
-    at = first.world.sigmas[0] if sigma is None else sigma
-    settings = [_setting(part.scenario) for part in parts]
-    several = [
-        name
-        for name in ("trace", "policy", "latency")
-        if len({setting[name] for setting in settings}) > 1
-    ]
-    title = "" if "trace" in several else f"{first.label}: "
-    title += f"sigma {sigma_text(at)}, convention {first.world.convention}"
-    runs = [tuple(setting[name] for name in several) for setting in settings]
-    swept = [
-        key
-        for key, name in (("fps", "fps"), ("latency_scale", "scale"))
-        if len({(run, each[name]) for run, each in zip(runs, settings)}) > len(set(runs))
-    ]
-    if swept:
+    plotted = _Plotted.of(parts, sigma)
+    if plotted.swept:
         reports = [part.document() for part in parts]
-        names = [", ".join(run) for run in runs]
-        return figures.sweep_figure(reports, names, float(at), swept, title)
-    curves = {}
-    for part, run in zip(parts, runs):
-        if "trace" in several:
-            run = (str(Path(run[0]).with_suffix("")), *run[1:])
-        prefix = f"{', '.join(run)}: " if run else ""
-        found = figures.mean_curves(part.totals.curves, list(part.scenario.forecasters))
-        curves.update({prefix + name: curve for name, curve in found.items()})
-    return figures.success_and_precision(curves, title)
+        names = [", ".join(run) for run in plotted.runs]
+        return sweep_figure(reports, names, float(plotted.at), plotted.swept, plotted.setting)
+    return success_and_precision(plotted.curves(parts), plotted.setting)
+
+
+def _metric(panel: Panel) -> str:
+    """The metric of a panel, as files are named."""
+    return panel.ylabel.lower().replace(" at 20 px", "20")
+
+
+def figures_for_paper(
+    parts: Sequence[Evaluated], sigma: Fraction | None = None
+) -> Iterator[ColumnFigure]:
+    """The same in the style of a paper, one by one; then scores over sigma, and a timeline.
+
+    The timeline is of the first sequence of the first trace, if its policy scores latency.
+    """
+    from lae_sim.figures.column import ColumnFigure
+    from lae_sim.figures.lines import panel_in_column
+    from lae_sim.figures.replay import (
+        curves_for_paper,
+        sigma_panels,
+        sweep_panels,
+        timeline_for_paper,
+    )
+
+    plotted = _Plotted.of(parts, sigma)
+    reports = [part.document() for part in parts]
+    names = [", ".join(run) for run in plotted.runs]
+    if plotted.swept:
+        at, swept = float(plotted.at), plotted.swept
+        for panel in sweep_panels(reports, names, at, swept, of_paper=True):
+            yield ColumnFigure(
+                f"{_metric(panel)}-over-{swept[0]}-{panel.title}",
+                f"{panel.ylabel} over the {panel.xlabel}; {panel.title} {plotted.setting}",
+                panel_in_column(panel),
+            )
+    else:
+        yield from curves_for_paper(plotted.curves(parts), plotted.setting)
+    for part, report, name in zip(parts, reports, names):
+        if len(part.scenario.world.sigmas) > 1 and not plotted.swept:
+            for panel in sigma_panels(report):
+                yield ColumnFigure(
+                    f"{_metric(panel)}-over-sigma-{name}",
+                    f"{panel.ylabel} over the {panel.xlabel}; {part.scenario.label}",
+                    panel_in_column(panel),
+                )
+    first = parts[0].scenario
+    if scores_latency(first.world.rule()) and not any(first.costs.values()):
+        yield timeline_for_paper(next(iter(first.runs)), plotted.at)
 
 
 def evaluate(

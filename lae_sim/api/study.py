@@ -10,13 +10,15 @@ from typing import Any
 
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
+from lae_sim.figures.study import study_in_columns
 from lae_sim.progress import ProgressBar
 from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
-from lae_sim.report.study_tables import write_tables
-from lae_sim.report.study_view import View
+from lae_sim.report.paper import Paper, remove_paper, write_paper
+from lae_sim.report.study_tables import paper_tables
 from lae_sim.study.run import StudyResults, check_inputs, compute_study
 from lae_sim.study.spec import Study, read_study
+from lae_sim.study.view import View
 
 
 def run_study(
@@ -38,7 +40,7 @@ def run_study(
             Finished parts found there are not computed again.
         workers: processes on this machine; by default one for each core. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead.
-        report: whether to write ``report.html`` and ``tables/`` too.
+        report: whether to write ``report.html``, ``figures/`` and ``tables/`` too.
         progress: whether to show a progress bar; by default on a terminal and in a notebook.
         keys: keys of the study file (see :class:`Study`).
 
@@ -97,12 +99,13 @@ def _asked_for(
 
 
 def write_views(results: StudyResults, report: bool = True) -> None:
-    """Write the report and the tables of a study beside its results, or take old ones away."""
-    page, tables = results.folder / "report.html", results.folder / "tables"
+    """Write the report and what a paper needs beside a study's results, or take old ones away."""
+    page = results.folder / "report.html"
     if report:
         view = View(results)
-        write_tables(view, tables)
+        frames = {"scores": view.results.scores_frame()}
+        write_paper(Paper(study_in_columns(view), paper_tables(view), frames), results.folder)
         write_report(view, page)
         return
-    for path in (page, *tables.glob("*.*")):
-        path.unlink(missing_ok=True)  # it would be of other results
+    remove_paper(results.folder)  # it would be of other results
+    page.unlink(missing_ok=True)

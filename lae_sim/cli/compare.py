@@ -14,13 +14,13 @@ from lae_sim.cli.options import (
     add_search,
     add_worlds,
     argument,
+    check_folder,
     check_outputs,
     exit_status,
     new_parser,
     print_json,
 )
 from lae_sim.engine.clock import parse_rational, whole
-from lae_sim.errors import LaeError
 from lae_sim.learning.registry import COMPARED, FORECASTERS
 from lae_sim.progress import print_text
 
@@ -37,6 +37,7 @@ examples:
   lae-sim compare nano.parquet --latency constant:47ms,init=800ms by-call,init=1s
   lae-sim compare nano.parquet --latency-scale 1/2 1 2 4 --forecaster learned kalman --attributes
   lae-sim compare nano.parquet --forecaster kalman camera+kalman --root ~/data/DTB70 --out all.csv
+  lae-sim compare a.parquet b.parquet --sigma-grid --out paper      figures and tables in a folder
   lae-sim compare nano.parquet --latency constant:47ms --search c=0.7 --pre-forecaster kalman
   lae-sim compare nano.parquet dcf.parquet --strided nano.gaps.parquet dcf.gaps.parquet
   lae-sim compare nano.parquet --forecaster kalman mine:Midway --cost mine:Midway=2ms --json
@@ -85,7 +86,12 @@ def parser() -> argparse.ArgumentParser:
     output = made.add_argument_group("output")
     add = output.add_argument
     add("--json", action="store_true", help="print one JSON object instead of tables")
-    add("--out", metavar="FILE", help="write every score of every sequence (.csv or .parquet)")
+    add(
+        "--out",
+        metavar="DIR",
+        help="write what a paper needs: figures as PDF and SVG, tables as LaTeX, CSV and Parquet; "
+        "or, to a .csv or .parquet file, every score of every sequence",
+    )
     add("--plot", metavar="FILE", help="draw the comparison (.png, .svg, .pdf)")
     return made
 
@@ -126,18 +132,20 @@ def _compare(arguments: argparse.Namespace) -> None:
         folds=arguments.folds,
         seed=arguments.seed,
     )
-    if arguments.out:
-        _write(result.scores, arguments.out)
+    if arguments.out and not _is_folder(arguments.out):
+        from lae_sim.report.paper import write_frame_file
+
+        write_frame_file(result.scores, Path(arguments.out))
     tables = {"summary": result.summary}
     if arguments.attributes:
         tables["attributes"] = result.attributes
     if arguments.plot:
-        from lae_sim.report.style import save
+        from lae_sim.figures.style import save
 
         save(result.plot(), arguments.plot)
     if arguments.sigma_grid:
         tables = {name: table.assign(sigma="0, 0.02, ..., 1") for name, table in tables.items()}
-    if arguments.json:
+    if arguments.json or (arguments.out and _is_folder(arguments.out)):
         document: dict[str, Any] = {
             "format": "lae-compare",
             "version": "1.0",
@@ -154,6 +162,9 @@ def _compare(arguments: argparse.Namespace) -> None:
             **{name: _records(table) for name, table in tables.items()},
         }
         document["summary"] = [_with_modelled(row) for row in document["summary"]]
+    if arguments.out and _is_folder(arguments.out):
+        result.write(arguments.out, {"compare.json": document})
+    if arguments.json:
         print_json(document)
         return
     for table in reversed(tables.values()):
@@ -164,28 +175,18 @@ def _compare(arguments: argparse.Namespace) -> None:
 
 def _check_files(arguments: argparse.Namespace, traces: Sequence[str]) -> None:
     """Refuse what would only fail after the work."""
-    outputs = [path for path in (arguments.out, arguments.plot) if path]
-    check_outputs(arguments, outputs, traces)
-    if arguments.out and Path(arguments.out).suffix not in (".csv", ".parquet"):
-        raise LaeError(f"--out {arguments.out}: name a .csv or .parquet file")
+    check_outputs(arguments, [arguments.out, arguments.plot], traces)
+    if arguments.out and _is_folder(arguments.out):
+        check_folder(arguments.out, ", or a .csv or .parquet file")
     if arguments.plot:
-        from lae_sim.report.style import check_format
+        from lae_sim.figures.style import check_format
 
         check_format(arguments.plot)
 
 
-def _write(table: DataFrame, path: str) -> None:
-    """Write the table, whole or not at all."""
-    from lae_sim.files import csv_cell, written_whole
-
-    with written_whole(path) as temporary:
-        if path.endswith(".csv"):
-            texts = [name for name in table if table[name].dtype.kind == "O"]
-            quoted = {name: [*map(csv_cell, table[name])] for name in texts}
-            table.assign(**quoted).to_csv(temporary, index=False, encoding="utf-8")
-        else:
-            with open(temporary, "wb") as file:  # whose name need not be UTF-8
-                table.to_parquet(file, index=False)
+def _is_folder(out: str) -> bool:
+    """Whether ``--out`` names a folder, and not a file of scores."""
+    return Path(out).suffix not in (".csv", ".parquet")
 
 
 def _records(table: DataFrame) -> list[dict[str, Any]]:

@@ -41,24 +41,14 @@ examples:
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``lae-sim convert``; see ``--help``."""
-    arguments = _parser().parse_args(argv)
-    return exit_status(
-        lambda: _convert(arguments),
-        "lae-sim convert",
-        arguments.max_decoded,
-        prints_result=False,
-    )
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = new_parser(
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = new_parser(
         "lae-sim convert",
         "Make a trace from a tracker's results and the dataset's ground truth.",
         _EXAMPLES,
     )
-    add = parser.add_argument
+    add = made.add_argument
     add("results", type=Path, metavar="RESULTS", help="folder of one tracker's results, or a file")
     add("--truth", type=Path, required=True, metavar="ROOT", help="the dataset's folder")
     add("--out", type=Path, required=True, metavar="TRACE", help="the trace to write (.parquet)")
@@ -108,7 +98,18 @@ def _parser() -> argparse.ArgumentParser:
         help="replace a trace of another tracker or dataset, or what is no trace",
     )
     add("--json", action="store_true", help="print the summary as JSON")
-    return parser
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status is 2 for bad input."""
+    arguments = parser().parse_args(argv)
+    return exit_status(
+        lambda: _convert(arguments),
+        "lae-sim convert",
+        arguments.max_decoded,
+        prints_result=False,
+    )
 
 
 def _convert(arguments: argparse.Namespace) -> None:

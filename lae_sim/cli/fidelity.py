@@ -67,7 +67,7 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     from lae_sim.report.comparison import fidelity_table, fidelity_verdicts, spread_table
 
     if arguments.plot:
-        from lae_sim.report.style import check_format
+        from lae_sim.figures.style import check_format
 
         check_format(arguments.plot)
         check_outputs(arguments, [arguments.plot], arguments.traces)
@@ -82,8 +82,8 @@ def _fidelity(arguments: argparse.Namespace) -> None:
     summary, spreads = summarise_closed_loops(rows), closed_loop_spreads(rows)
     overall, verdicts = summarise_replays(rows), fidelity_verdicts(rows, spreads)
     if arguments.plot:
-        from lae_sim.report.figures import fidelity_figure
-        from lae_sim.report.style import save
+        from lae_sim.figures.replay import fidelity_figure
+        from lae_sim.figures.style import save
 
         save(fidelity_figure(rows, "Replays against closed loops"), arguments.plot)
     if arguments.json:

@@ -379,6 +379,23 @@ def check_outputs(
     check_places(path for path in written if not os.path.isdir(path))
 
 
+def check_folder(folder: str, or_else: str = "") -> None:
+    """Refuse, before the work, a folder that figures and tables cannot be written to.
+
+    Args:
+        folder: the folder, one of those that :func:`check_outputs` looked at.
+        or_else: what else could be named.
+
+    Raises:
+        LaeError: if it is a file, or called like one, or cannot be written to.
+    """
+    if os.path.isdir(folder):
+        if not os.access(folder, os.W_OK):
+            raise LaeError(f"--out {folder}: it cannot be written to: name another folder")
+    elif os.path.exists(folder) or os.path.splitext(folder)[1]:
+        raise LaeError(f"--out {folder}: name a folder (NAME.WITH.POINTS/ ends in /){or_else}")
+
+
 def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]:
     """The worlds that the options of :func:`add_world` or :func:`add_worlds` name, in their order.
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import add_world, check_outputs, exit_status, new_parser, worlds_of
 from lae_sim.errors import LaeError
+from lae_sim.figures.film import Scene, writes_h264
 from lae_sim.files import file_names
 from lae_sim.learning.registry import load_forecaster
-from lae_sim.report.film import Scene
+from lae_sim.progress import tell
 
 if TYPE_CHECKING:
     from lae_sim.datasets.frames import ImageSequence
@@ -96,6 +97,11 @@ def _render(arguments: argparse.Namespace) -> None:
     sequences = {run.recording.name: _images(run, metadata, arguments) for run in runs}
     camera = Camera(sequences, runs[0].schedule.clock.fps)
     forecasters = {name: load_forecaster(name, camera) for name in arguments.forecaster}
+    if (folder or kind == ".mp4") and not writes_h264():
+        tell(
+            f"{PROGRAM}: films are MPEG-4 Part 2 here, which browsers do not play: "
+            "pip install 'lae-sim[film]' makes them H.264"
+        )
     for run, film in zip(runs, films):
         scene = Scene.of(run, sequences[run.recording.name], metadata, forecasters)
         if folder:

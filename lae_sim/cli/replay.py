@@ -14,6 +14,7 @@ from lae_sim.cli.options import (
     add_search,
     add_world,
     argument,
+    check_folder,
     check_outputs,
     exit_status,
     new_parser,
@@ -45,6 +46,7 @@ examples:
   lae-sim replay trace.parquet --latency constant:47ms,init=800ms --strided trace.gaps.parquet
   lae-sim replay trace.parquet --latency constant:47ms --search c=0.7 --pre-forecaster kalman
   lae-sim replay a.parquet b.parquet --latency-scale 2 --json | jq '.traces[].results[].auc'
+  lae-sim replay a.parquet b.parquet --sigma-grid --out paper       figures and tables in a folder
   lae-sim replay trace.parquet --forecaster my_package.my_module:MyForecaster --per-sequence
 
 {FORECASTERS}
@@ -114,6 +116,11 @@ def parser() -> argparse.ArgumentParser:
         "picture of the first sequence",
     )
     add("--export-txt", metavar="DIR", help="write result text files for the pysot toolkit")
+    add(
+        "--out",
+        metavar="DIR",
+        help="write what a paper needs: figures as PDF and SVG, tables as LaTeX, CSV and Parquet",
+    )
     add("--plot", metavar="FILE", help="draw success and precision, or a sweep (.png, .svg, .pdf)")
     return made
 
@@ -161,15 +168,15 @@ def _replay(arguments: argparse.Namespace) -> None:
         camera_lag=arguments.camera_lag,
     )
     if arguments.plot:
-        from lae_sim.report.style import check_format
+        from lae_sim.figures.style import check_format
 
         check_format(arguments.plot)
     observed = list(product(arguments.forecaster, arguments.sigma))
     with ExitStack() as files, scenario_bar(asked) as advance:  # a failure leaves no file behind
         scored = tuple(
             scenario.evaluate(
-                attributes=arguments.attributes,
-                sequences=arguments.per_sequence,
+                attributes=arguments.attributes or arguments.out is not None,
+                sequences=arguments.per_sequence or arguments.out is not None,
                 curves_at=arguments.sigma[0],
                 observers=_observers(scenario, arguments, files),
                 observed=observed if arguments.outputs or arguments.export_txt else (),
@@ -178,10 +185,12 @@ def _replay(arguments: argparse.Namespace) -> None:
             for scenario in asked
         )
         if arguments.plot:
-            from lae_sim.report.style import save
+            from lae_sim.figures.style import save
 
             save(plot_evaluations(scored, arguments.sigma[0]), arguments.plot)
     result = EvaluationResult(scored)
+    if arguments.out is not None:
+        result.write(arguments.out)
     document = result.document(arguments.attributes, arguments.per_sequence)
     if arguments.json:
         print_json(document)
@@ -200,8 +209,10 @@ def _check_files(arguments: argparse.Namespace, swept: Sequence[str]) -> None:
         raise LaeError(f"--{asked[0]} takes one frame rate and one scale of the times at a time")
     if arguments.strided and len(arguments.traces) > 1:
         raise LaeError("--strided goes with one trace at a time")
-    outputs = [*(getattr(arguments, name) for name in _FILES), arguments.plot]
+    outputs = [*(getattr(arguments, name) for name in _FILES), arguments.plot, arguments.out]
     check_outputs(arguments, outputs, arguments.traces)
+    if arguments.out is not None:
+        check_folder(arguments.out)
 
 
 def _observers(

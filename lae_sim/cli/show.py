@@ -17,15 +17,15 @@ examples:
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``lae-sim show``; see ``--help``."""
-    parser = new_parser(
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = new_parser(
         "lae-sim show",
-        "Say what a trace holds, and how its processing times are distributed; of a gap pass "
+        "Say what a trace holds, and how its processing times are distributed; of a gap pass\n"
         "(lae-sim profile --gaps), what the tracker's reach is.",
         _EXAMPLES,
     )
-    add = parser.add_argument
+    add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add("--json", action="store_true", help="print one JSON object instead of text")
     add(
@@ -33,7 +33,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar="FILE",
         help="draw the times, or of gap passes the reach (.png, .svg, .pdf)",
     )
-    arguments = parser.parse_args(argv)
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status is 2 for bad input."""
+    arguments = parser().parse_args(argv)
     return exit_status(lambda: _show(arguments), "lae-sim show", arguments.max_decoded)
 
 
@@ -48,7 +53,7 @@ def _show(arguments: argparse.Namespace) -> None:
 
     paths = find_traces(arguments.traces)
     if arguments.plot:
-        from lae_sim.report.style import check_format
+        from lae_sim.figures.style import check_format
 
         check_outputs(arguments, [arguments.plot], paths)
         check_format(arguments.plot)
@@ -60,7 +65,7 @@ def _show(arguments: argparse.Namespace) -> None:
     reports = [report for report, _ in described]
     reaches = [ReachReport.of(trace) if gaps else None for trace, gaps in zip(traces, are_gaps)]
     if arguments.plot and all(are_gaps):
-        from lae_sim.report.style import save
+        from lae_sim.figures.style import save
 
         save(reach_figure([reach for reach in reaches if reach is not None]), arguments.plot)
     elif arguments.plot:

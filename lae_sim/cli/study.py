@@ -65,7 +65,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--workers", type=argument(lambda text: whole(text, 1)), help="processes (default: cores)")
     add("--scheduler", metavar="ADDRESS", help="a Dask cluster to compute on, tcp://host:8786")
-    add("--no-report", action="store_true", help="write no report.html and no tables")
+    add("--no-report", action="store_true", help="write no report, figures and tables")
     add("--json", action="store_true", help="print what study.json holds instead of tables")
     return made
 

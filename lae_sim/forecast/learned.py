@@ -369,7 +369,8 @@ def read_learned(path: str | os.PathLike[str]) -> Learned:
 def shipped() -> Guarded:
     """The forecaster that comes with the package, guarded.
 
-    ``lae-sim train --made-up`` made its weights (README, "Forecasters"): no real motion is in them.
+    ``lae-sim train --made-up`` made its weights: no real motion is in them
+    (docs/concepts/forecasters.md).
     """
     return Guarded(read_learned(SHIPPED))
 

@@ -1,4 +1,4 @@
-"""What people look at: tables as text, CSV, LaTeX and HTML; figures, pages, films, timelines."""
+"""What people read: tables as text, CSV, LaTeX and HTML, pages, and files for other programs."""
 
 from lae_sim._faces import lazy_face
 

@@ -15,8 +15,11 @@ from lae_sim.comparison.fidelity import (
     FidelitySummary,
 )
 from lae_sim.comparison.statistics import KEYS
+from lae_sim.errors import visible
+from lae_sim.figures.labels import METRIC_LABELS, setting_label
+from lae_sim.report.paper import PaperTable, TrackerScores, in_two_forms, with_and_without
 from lae_sim.report.table import (
-    METRIC_LABELS,
+    COUNT,
     PERCENT,
     SCORE,
     SIGNED,
@@ -26,12 +29,13 @@ from lae_sim.report.table import (
     ends_text,
     is_unknown,
     p_label,
-    setting_label,
     text_of,
 )
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from lae_sim.trace.metadata import Metadata
 
 Row = Mapping[str, Any]
 
@@ -90,6 +94,102 @@ def comparison_table(summary: pd.DataFrame) -> str:
     caption = ", ".join(shared) + "\n\n" if shared else ""
     method = f"\n{summary.attrs['method']}" if "method" in summary.attrs else ""
     return caption + text_of(Table.of(columns, rows), [*intervals, "recovered"]) + method
+
+
+def paper_tables(
+    summary: pd.DataFrame,
+    metrics: Sequence[str],
+    metadata: Mapping[str, Metadata],
+    attributes: pd.DataFrame | None = None,
+) -> list[PaperTable]:
+    """The tables of a comparison, whole and for a paper.
+
+    Args:
+        summary: what :func:`summarise` gave.
+        metrics: those compared: AUC first, then DP.
+        metadata: of each trace.
+        attributes: what :func:`by_attribute` gave.
+    """
+    tables = [_paper_table(summary, metrics[0], "comparison")]
+    tables.append(_in_layout(summary, metrics, metadata))
+    if attributes is not None:
+        tables.append(_paper_table(attributes, metrics[0], "attributes"))
+    return tables
+
+
+def _paper_table(summary: pd.DataFrame, metric: str, name: str) -> PaperTable:
+    """A row per trace, setting and forecaster; for a paper at the smallest sigma.
+
+    In a column there are only means and what is recovered.
+    """
+    whole = _comparison(summary, metric, name)
+    at_first = summary[summary["sigma"] == summary["sigma"].min()]
+    long = _comparison(at_first, metric, name)
+    short = long.only(lambda _, column: column.title not in ("n", "vs hold", "p"))
+    return PaperTable(whole, long, short)
+
+
+def _comparison(summary: pd.DataFrame, metric: str, name: str) -> Table:
+    """A row per trace, setting and forecaster, with intervals."""
+    label = METRIC_LABELS.get(metric, metric)
+    rows = summary[summary["metric"] == metric]
+    rows = rows.assign(trace=rows["trace"].str.removesuffix(".parquet"))
+    rows = rows.assign(
+        latency=[setting_label(*both) for both in zip(rows["latency"], rows["scale"])]
+    )
+    rows = rows.rename(columns={"low": "mean_low", "high": "mean_high"})
+    labels = [*(["attribute"] if "attribute" in rows else []), "trace", "latency", "sigma"]
+    shared = [f"{key} {rows[key].iloc[0]}" for key in labels[-3:-1] if rows[key].nunique() == 1]
+    labels = [key for key in labels if rows[key].nunique() > 1]
+    columns = [
+        *(Column(key, key, is_label=True) for key in [*labels, "forecaster"]),
+        Column("n", "sequences", COUNT),
+        Column(label, "mean", SCORE, name=metric),
+        Column("recovered", "recovered", Number(".1f", 100, "%", ".0f")),
+        Column("vs hold", "vs_hold", SIGNED),
+        Column("p", "vs_hold_p", p_label),
+    ]
+    records = rows.to_dict("records")
+    for record in records:
+        if record["forecaster"] in ("hold", "offline"):
+            record["recovered"] = None
+        if record["forecaster"] == "hold":
+            record |= {"vs_hold": None, "vs_hold_p": None}
+    caption = f"{label} of forecasters" + (" by attribute" if "attribute" in rows else "")
+    return Table.of(columns, records, name, "; ".join([caption, *shared]))
+
+
+def _in_layout(
+    summary: pd.DataFrame, metrics: Sequence[str], metadata: Mapping[str, Metadata]
+) -> PaperTable:
+    """Trackers with and without forecasters, at the first sigma."""
+    auc, dp20 = metrics[:2]
+    rows = summary[
+        summary["trace"].isin([*metadata]) & (summary["sigma"] == summary["sigma"].min())
+    ]
+    trackers = {name: visible(each.tracker) for name, each in metadata.items()}
+    kinds = {(each.tracker, each.dataset) for each in metadata.values()}
+    alone = len(kinds) == len(metadata) and "unknown" not in trackers.values()
+    settings = ("latency", "scale")
+    several = rows[[*settings]].drop_duplicates().shape[0] > 1
+    scores = []
+    for (trace, latency, scale), group in rows.groupby(["trace", *settings], sort=False):
+        means = group.set_index(["forecaster", "metric"])["mean"].to_dict()
+        name = trackers[trace] if alone else trace.removesuffix(".parquet")
+        name += f", {setting_label(latency, scale)}" if several else ""
+        offline = {"auc": means.get(("offline", auc)), "dp20": means.get(("offline", dp20))}
+        for forecaster in dict.fromkeys(group["forecaster"]):
+            if forecaster != "offline":
+                of = {"auc": means[forecaster, auc], "dp20": means.get((forecaster, dp20))}
+                dataset = str(metadata[trace].dataset)
+                scores.append(TrackerScores(name, dataset, forecaster, of, offline))
+    titles = {key: METRIC_LABELS[metric].replace("DP@20", "DP") for key, metric in
+              zip(("auc", "dp20"), metrics)}  # fmt: skip
+    latencies = [setting_label(*each) for each in zip(rows["latency"], rows["scale"])]
+    setting = f"sigma {rows['sigma'].iloc[0]:g}" if "mauc" not in auc else "mean over sigma"
+    setting += "" if several else f", latency {latencies[0]}"
+    forecasters = dict.fromkeys(row.forecaster for row in scores)
+    return in_two_forms(with_and_without(scores, forecasters, titles, setting))
 
 
 def _ends(name: str, row: Row) -> str | None:

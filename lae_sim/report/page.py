@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 from lae_sim import __version__
 from lae_sim.errors import visible
 from lae_sim.evaluation.metrics import CONVENTIONS, Convention
+from lae_sim.figures import study as study_figures
+from lae_sim.figures.study import SWEEPS, Picture
 from lae_sim.files import written_whole
-from lae_sim.report import study_figures, study_tables
-from lae_sim.report.study_figures import SWEEPS, Picture
-from lae_sim.report.study_view import View
+from lae_sim.report import study_tables
 from lae_sim.report.table import COUNT, PERCENT, Column, Number, Table
 from lae_sim.study.verdict import shortfalls
+from lae_sim.study.view import View
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults

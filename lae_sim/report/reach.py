@@ -12,6 +12,7 @@ import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.errors import visible
+from lae_sim.figures.style import BLUE, SKY_BLUE, VERMILION, new_figure, styled
 from lae_sim.replay.reach import (
     LAPSE,
     LEAST_RESTARTS,
@@ -22,7 +23,6 @@ from lae_sim.replay.reach import (
     own_jumps,
     restarts_of,
 )
-from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, styled
 from lae_sim.report.table import COUNT, PERCENT, Cell, Column, Table, text_of
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Search

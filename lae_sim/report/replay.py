@@ -15,18 +15,23 @@ from typing import Any
 import numpy as np
 
 from lae_sim.engine.clock import Clock
+from lae_sim.errors import visible
 from lae_sim.evaluation.caveats import left_search, search_notes
 from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED
 from lae_sim.evaluation.totals import RECOVERED, ModelledTotals, ScoreTotals, Totals, recovered
 from lae_sim.replay.world import SIGMA_GRID
+from lae_sim.report.paper import PaperTable, TrackerScores, in_two_forms, with_and_without
 from lae_sim.report.table import (
     CHANGE,
+    COUNT,
     FINE_SCORE,
     PERCENT,
+    SCORE,
     Column,
     Number,
+    Table,
     ends_text,
     relative_change,
     text_of_records,
@@ -47,7 +52,7 @@ def trace_report(
     per_sequence: SequenceRows | None = None,
     attributes: bool = True,
 ) -> Report:
-    """The figures of one trace as a JSON object (documented in the README).
+    """The figures of one trace as a JSON object (described in docs/reference/json.md).
 
     Args:
         totals: scores, whose forecasters and sigmas are the ones named.
@@ -428,3 +433,94 @@ def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequenc
         for line, scores in zip(lines, rows)
     )
     return _text(columns, records, "sequence", swept)
+
+
+_SETTING = {
+    "policy": "policy {}",
+    "fps": "world {} fps",
+    "latency": "latency {}",
+    "latency_scale": "times x {}",
+    "times_from": "times from {}",
+    "convention": "convention {}",
+}
+"""What says how a trace was replayed, in words."""
+
+
+def paper_tables(reports: Sequence[Report], labels: Sequence[str]) -> list[PaperTable]:
+    """Trackers with and without forecasters at the first sigma, or over the grid; attributes.
+
+    Args:
+        reports: of traces, perhaps each in several worlds.
+        labels: the trace's name for each report.
+    """
+    names = _tracker_names(reports, labels)
+    over_grid = all("mauc" in report["results"][0] for report in reports)
+    titles = {"auc": "mAUC", "dp20": "mDP"} if over_grid else {"auc": "AUC", "dp20": "DP"}
+    keys = {"auc": "mauc", "dp20": "mdp"} if over_grid else {"auc": "auc", "dp20": "dp20"}
+    scores, by_attribute = [], []
+    for name, report in zip(names, reports):
+        offline = report["offline"] or dict.fromkeys(METRICS)
+        first = report["results"][0]["sigma"]
+        for result in report["results"]:
+            if result["sigma"] != first:
+                continue
+            forecaster = result["forecaster"]
+            means = {metric: result[key] for metric, key in keys.items()}
+            scores.append(TrackerScores(name, str(report["dataset"]), forecaster, means, offline))
+            by_attribute += [
+                {"tracker": name, "attribute": attribute, "forecaster": forecaster, **each}
+                for attribute, each in result.get("attributes", {}).items()
+            ]
+    shared = _shared(reports, over_grid)
+    forecasters = dict.fromkeys(row.forecaster for row in scores)
+    tables = [in_two_forms(with_and_without(scores, forecasters, titles, shared))]
+    if by_attribute:
+        columns = [
+            *(Column(key, key, is_label=True) for key in ("tracker", "attribute", "forecaster")),
+            Column("n", "sequences", COUNT),
+            Column("AUC", "auc", SCORE),
+            Column("DP", "dp20", SCORE),
+            Column("recovered", "recovered_auc", PERCENT),
+        ]
+        at_first = _shared(reports, False)
+        caption = f"Scores on the sequences of each attribute (n of them); {at_first}"
+        by_attribute.sort(key=itemgetter("tracker", "attribute"))
+        table = Table.of(columns, by_attribute, "attributes", caption)
+        tables.append(PaperTable(table, table, table))
+    return tables
+
+
+def _tracker_names(reports: Sequence[Report], labels: Sequence[str]) -> list[str]:
+    """What rows are called: trackers or, where these are not told apart by them, traces.
+
+    Of several worlds the name says which, too.
+    """
+    kinds = {(report["tracker"], report["dataset"]) for report in reports}
+    alone = len(kinds) == len(set(labels)) and all(name != "unknown" for name, _ in kinds)
+    differing = [
+        key
+        for key in _SETTING
+        if key != "times_from" and len({report[key] for report in reports}) > 1
+    ]
+    return [
+        ", ".join([
+            visible(report["tracker"]) if alone else label.removesuffix(".parquet"),
+            *(_SETTING[key].format(report[key]) for key in differing),
+        ])
+        for report, label in zip(reports, labels)
+    ]  # fmt: skip
+
+
+def _shared(reports: Sequence[Report], over_grid: bool) -> str:
+    """What all reports have in common, in words."""
+    parts = []
+    for key, words in _SETTING.items():
+        values = {report[key] for report in reports}
+        own = key == "times_from" and all(r["times_from"] == r["trace"] for r in reports)
+        if len(values) == 1 and not own:
+            parts.append(words.format(visible(values.pop())))
+    sigma = f"sigma {reports[0]['results'][0]['sigma']:g}"
+    parts.append("mean over sigma = 0, 0.02, ..., 1" if over_grid else sigma)
+    if any(result["modelled"] for report in reports for result in report["results"]):
+        parts.append("of the recorded boxes")
+    return ", ".join(parts)

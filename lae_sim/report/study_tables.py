@@ -1,6 +1,6 @@
 """The tables of a study: for its page, as CSV and LaTeX for a paper, and as text for a terminal.
 
-Tables for a paper show the settings that stand for all (see :mod:`lae_sim.report.study_view`), and
+Tables for a paper show the settings that stand for all (see :mod:`lae_sim.study.view`), and
 those for a terminal fewer columns.
 """
 
@@ -12,22 +12,17 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
-from itertools import product
-from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.comparison.statistics import ALL_TRACES
-from lae_sim.errors import visible
-from lae_sim.files import written_whole
-from lae_sim.report.study_view import (
-    SETTINGS,
-    View,
-    run_of,
-    score_name,
-    setting_of,
-    several,
-    shared_setting,
+from lae_sim.errors import LaeError
+from lae_sim.report.paper import (
+    PaperTable,
+    TrackerScores,
+    in_two_forms,
+    with_and_without,
+    write_table,
 )
 from lae_sim.report.table import (
     CHANGE,
@@ -40,15 +35,22 @@ from lae_sim.report.table import (
     Number,
     Table,
     filled,
-    latex_of,
     legend_of,
     p_label,
     relative_change,
     text_of,
-    write_csv,
 )
 from lae_sim.study.records import Comparison, Requirement, SummaryRow
 from lae_sim.study.verdict import device_in_words, shortfalls, significant
+from lae_sim.study.view import (
+    SETTINGS,
+    View,
+    run_of,
+    score_name,
+    setting_of,
+    several,
+    shared_setting,
+)
 
 if TYPE_CHECKING:
     from lae_sim.study.run import StudyResults
@@ -89,10 +91,11 @@ _RANKING = (
     Column("AUC", "auc", SCORE, "with its 95 % interval over sequences"),
     Column("modelled", "modelled_auc", SCORE, "AUC under the search model, with its interval"),
     Column("ranked by", "ranked_by", meaning="whose AUC is ranked, compared and tested"),
-    Column("jitter", _jitter, meaning="the range of 95 % of the repetitions' AUC"),
+    Column("jitter", _jitter, meaning="the range of 95 % of the repetitions' AUC",
+           name="auc_jitter"),
     Column("offline", "offline_auc", SCORE, "AUC without latency"),
     Column("change", lambda row: relative_change(row["ranked_auc"], row["offline_auc"]), CHANGE,
-           "of the AUC, to offline"),
+           "of the AUC, to offline", name="auc_change"),
     Column("recovered", "recovered_auc", _RECOVERED,
            "share of the AUC lost to latency that the forecaster wins back"),
     Column("vs hold", "vs_hold_auc", SIGNED, "AUC won over hold"),
@@ -116,12 +119,20 @@ _RANKING = (
     Column("to failure s", "time_to_failure_ms", Number(".1f", 1e-3), "median time to the first "
            "such answer (Kaplan and Meier); unknown if less than half fail"),
     Column("front", lambda row: Cell("★" if row["pareto"] else "", int(row["pareto"])),
-           meaning="with the same forecaster, no other trace is both faster and better"),
+           meaning="with the same forecaster, no other trace is both faster and better",
+           name="pareto"),
     Column("replay", _exactness,
-           meaning="the share of outputs that follow another frame than when recorded"),
+           meaning="the share of outputs that follow another frame than when recorded",
+           name="approximate_share"),
     Column("engine", "engine", meaning="batch, or simpy where policy or latency need it"),
 )  # fmt: skip
+_COLUMN = ("AUC", "modelled", "offline", "DP", "ms/call")
 _PAPER = ("AUC", "modelled", "offline", "change", "recovered", "vs hold", "p", "DP", "ms/call")
+_REQUIRED = (
+    "safe_ms_per_frame",
+    "safe_frames_per_second",
+    "auc_without_latency",
+)  # of them in a column of a paper
 _TERMINAL = ("n", "AUC", "modelled", "ranked by", "jitter", "offline", "recovered", "vs hold", "p",
              "vs best", "p (best)", "DP", "ms/call", "init ms", "skipped", "age ms",
              "front")  # fmt: skip
@@ -170,7 +181,10 @@ def _named(column: Column, rows: Sequence[SummaryRow]) -> Column:
     def named(text: str) -> str:
         return re.sub(r"\b(AUC|DP)\b", lambda found: score_name(found[0], rows), text)
 
-    return replace(column, title=named(column.title), meaning=named(column.meaning))
+    key = column.key
+    if score_name("AUC", rows) == "mAUC":
+        key = re.sub(r"(?<![a-z])(?=(auc|dp20)(_|$))", "m", key)
+    return replace(column, title=named(column.title), meaning=named(column.meaning), name=key)
 
 
 def _as_ranked(row: SummaryRow) -> dict[str, Any]:
@@ -186,72 +200,20 @@ def _as_ranked(row: SummaryRow) -> dict[str, Any]:
 
 
 def table2(view: View) -> Table:
-    """Trackers with and without forecasters in rows, datasets in columns.
-
-    In the manner of Table II of Li et al., "Predictive Visual Tracking", 2021: AUC and DP of each
-    dataset, and how they change: without a forecaster relative to offline, with one relative to
-    without. (Rows and columns are ours; the print may order them otherwise.)
-    """
+    """Trackers with and without forecasters (see :func:`.paper.with_and_without`)."""
     rows = view.standing
-    by_name = {(view.names[run_of(row)], row.dataset, row.forecaster): row for row in rows}
-    trackers = dict.fromkeys(tracker for tracker, _, _ in by_name)
-
-    def columns(dataset: str, metric: str, title: str) -> list[Column]:
-        """A score and its change; records are a tracker and a forecaster."""
-
-        def score(record: tuple[str, str]) -> float | None:
-            tracker, forecaster = record
-            offline = forecaster == "offline"
-            row = by_name.get((tracker, dataset, "hold" if offline else forecaster))
-            return None if row is None else row.offline[metric] if offline else row.score(metric)
-
-        def change(record: tuple[str, str]) -> float | None:
-            tracker, forecaster = record
-            if forecaster == "offline":
-                return None
-            before = "offline" if forecaster == "hold" else "hold"
-            return relative_change(score(record), score((tracker, before)))
-
-        group = visible(dataset)
-        return [
-            Column(title, score, SCORE, group=group),
-            Column("Δ", change, CHANGE, group=group, name=f"{title} Δ"),
-        ]
-
+    titles = {"auc": score_name("AUC", rows), "dp20": score_name("DP", rows)}
     scores = [
-        column
-        for dataset in dict.fromkeys(row.dataset for row in rows)
-        for metric, title in (("auc", score_name("AUC", rows)), ("dp20", score_name("DP", rows)))
-        for column in columns(dataset, metric, title)
+        TrackerScores(
+            view.names[run_of(row)],
+            row.dataset,
+            row.forecaster,
+            {metric: row.score(metric) for metric in titles},
+            row.offline,
+        )
+        for row in rows
     ]
-    table = Table.of(
-        [
-            Column("tracker", itemgetter(0), is_label=True),
-            Column("forecaster", itemgetter(1), is_label=True),
-            *scores,
-        ],
-        product(trackers, ("offline", *view.forecasters)),
-        "table2",
-        "Trackers with and without forecasters: hold changes relative to offline, forecasters "
-        "relative to hold; the best of each column under latency is bold, the second underlined; "
-        + shared_setting(rows),
-    )
-    places = [c for c, column in enumerate(table.columns) if column.form is SCORE]
-    return replace(table, rows=_with_ranks(table.rows, places))
-
-
-def _with_ranks(
-    rows: Iterable[tuple[Cell, ...]], columns: Sequence[int]
-) -> tuple[tuple[Cell, ...], ...]:
-    """Mark the best and the second best of some columns, but for offline."""
-    lines = [list(row) for row in rows]
-    for c in columns:
-        online = [line for line in lines if line[1].value != "offline" and line[c].value]
-        for rank, text in enumerate(sorted({line[c].text for line in online})[:-3:-1], 1):
-            for line in online:  # what reads the same is as good
-                if line[c].text == text:
-                    line[c] = replace(line[c], rank=rank)
-    return tuple(map(tuple, lines))
+    return with_and_without(scores, view.forecasters, titles, shared_setting(rows))
 
 
 def attribute_table(view: View, pooled: bool = False) -> Table | None:
@@ -334,13 +296,14 @@ def required_table(view: View) -> Table:
                "the slowest mean time of a call, the initialisations apart"),
         Column("fps", "safe_frames_per_second", significant,
                "frames that a tracker of this time processes per second"),
-        Column("device", "device", meaning="against the times that are replayed"),
+        Column("device", "device", meaning="against the times that are replayed",
+               name="scale_at_most"),
         Column("AUC there", "safe_auc", FINE_SCORE),
         Column("then", "next_auc", FINE_SCORE, "AUC with all times a hundredth longer"),
         Column("offline", "auc_without_latency", SCORE, "AUC without latency"),
         Column("or world fps", "world", _MS, "how fast the world may move instead, with the "
                "recorded motion from frame to frame; unknown where a cost or a policy has a time "
-               "of its own"),
+               "of its own", name="world_fps_at_most"),
     ]  # fmt: skip
     if any(row.ranked_by == "modelled" for row in rows):
         columns.append(Column("AUC is", "ranked_by", meaning="as the ranking has it"))
@@ -377,8 +340,35 @@ def _differing(rows: Sequence[Comparison | Requirement], keys: Iterable[str]) ->
     return [key for key in keys if len({getattr(row, key) for row in rows}) > 1]
 
 
+def paper_tables(view: View) -> list[PaperTable]:
+    """The tables of a study, whole and for a paper: those of the settings that stand for all."""
+    tables = [
+        PaperTable(
+            ranking(view),
+            ranking(view, _PAPER, standing_alone=True),
+            ranking(view, _COLUMN, standing_alone=True),
+        ),
+        in_two_forms(table2(view)),
+    ]
+    if whole := attribute_table(view):
+        pooled = attribute_table(view, pooled=True) or whole
+        short = pooled.only(lambda _, column: column.title not in ("offline", "p"))
+        tables.append(PaperTable(whole, pooled, short))
+    if view.results.comparisons:
+        compared = comparison_table(view)
+        short = compared.only(lambda _, column: not column.title.startswith("a better"))
+        tables.append(PaperTable(compared, compared, short))
+    if view.results.required:
+        required = required_table(view)
+        short = required.only(lambda _, column: column.is_label or column.key in _REQUIRED)
+        tables.append(PaperTable(required, required, short))
+    return tables
+
+
 def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -> None:
-    """Write every table as CSV, with numbers in full, and as LaTeX for a paper's ``input``.
+    """Write every table as CSV and Parquet, with numbers in full, and as LaTeX for a paper.
+
+    Of LaTeX there are two forms, ``NAME.tex`` for a column and ``NAME-long.tex`` for a page.
 
     Args:
         results: of a study, or a view of them, which the report may have in common.
@@ -395,30 +385,16 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
         ...         traces="traces/synthetic-slow.parquet", folder=folder, workers=1, report=False
         ...     )
         ...     lae_sim.write_tables(results, f"{folder}/paper")
-        ...     sorted(name for name in os.listdir(f"{folder}/paper") if name.endswith("tex"))
-        ['attributes.tex', 'ranking.tex', 'table2.tex']
+        ...     sorted(name for name in os.listdir(f"{folder}/paper") if "table2" in name)
+        ['table2-long.tex', 'table2.csv', 'table2.parquet', 'table2.tex']
     """
     view = results if isinstance(results, View) else View(results)
-    results = view.results
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    compared = comparison_table(view) if results.comparisons else None
-    required = required_table(view) if results.required else None
-    tables = {  # whole, and for a paper
-        "ranking": (ranking(view), ranking(view, _PAPER, standing_alone=True)),
-        "table2": (table2(view),) * 2,
-        "attributes": (attribute_table(view), attribute_table(view, pooled=True)),
-        "comparisons": (compared, compared),
-        "required": (required, required),
-    }
-    for name, (whole, for_paper) in tables.items():
-        csv, tex = (Path(folder, f"{name}.{ending}") for ending in ("csv", "tex"))
-        for path in (csv, tex):
-            path.unlink(missing_ok=True)  # it would be of other results
-        if whole is not None and for_paper is not None:
-            with written_whole(csv) as temporary:
-                write_csv(whole, temporary)
-            with written_whole(tex) as temporary:
-                temporary.write_text(latex_of(for_paper), "utf-8", "backslashreplace")
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LaeError(f"cannot write to {folder}: {error.strerror}") from error
+    for table in paper_tables(view):
+        write_table(table, Path(folder))
 
 
 def study_text(results: StudyResults | View) -> str:

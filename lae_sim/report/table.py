@@ -1,15 +1,17 @@
-"""Tables: columns that say how records are shown, as aligned text, CSV and LaTeX.
+"""Tables: columns that say how records are shown, as aligned text, CSV and Parquet.
 
-HTML is made of the same tables by the template of the page (see :mod:`lae_sim.report.page`).
+LaTeX is made by :mod:`lae_sim.report.latex`, and HTML by the template of the page (see
+:mod:`lae_sim.report.page`).
 """
 
 from __future__ import annotations
 
 import csv
+import os
 import re
 import textwrap
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -105,7 +107,7 @@ class Column:
         meaning: what the column holds, where the heading does not say it.
         is_label: whether it names the rows; such columns come first, and are left-aligned.
         group: a heading above this and the neighbouring columns of the same group.
-        name: its heading in CSV, if it is not the title.
+        name: its heading in CSV and Parquet, if it is not the name of the value.
     """
 
     title: str
@@ -115,6 +117,12 @@ class Column:
     is_label: bool = False
     group: str = ""
     name: str = ""
+
+    @property
+    def key(self) -> str:
+        """Its heading in CSV and Parquet, with the unit."""
+        plain = re.sub(r"\W+", "_", self.title).strip("_").lower()
+        return self.name or (self.value if isinstance(self.value, str) else plain)
 
     def cell(self, record: Any) -> Cell:
         """What the column shows of a record."""
@@ -170,6 +178,12 @@ class Table:
     def labels(self) -> int:
         """The number of columns that name the rows."""
         return sum(column.is_label for column in self.columns)
+
+    def only(self, keep: Callable[[int, Column], bool]) -> Table:
+        """The table of the columns that are to be kept, told by their place and themselves."""
+        kept = [place for place, column in enumerate(self.columns) if keep(place, column)]
+        rows = tuple(tuple(row[place] for place in kept) for row in self.rows)
+        return replace(self, columns=tuple(self.columns[place] for place in kept), rows=rows)
 
     @property
     def groups(self) -> list[tuple[str, int]]:
@@ -227,103 +241,43 @@ def aligned(header: Sequence[str], lines: Sequence[Sequence[str]], labels: int =
     return "\n".join(map(line, [header, ["-" * width for width in widths], *lines]))
 
 
+def columns_of(table: Table) -> list[tuple[str, list[Any]]]:
+    """What CSV and Parquet hold: a name and the values of each column, numbers in full.
+
+    An interval has two columns after its value's, of its name and ``_low`` and ``_high``.
+    """
+    columns: list[tuple[str, list[Any]]] = []
+    for place, column in enumerate(table.columns):
+        cells = [row[place] for row in table.rows]
+        name = f"{column.group} {column.key}".lstrip()
+        columns.append((name, [cell.value for cell in cells]))
+        if any(cell.interval for cell in cells):
+            for end, which in enumerate(("low", "high")):
+                ends = [cell.interval and cell.interval[end] for cell in cells]
+                columns.append((f"{name}_{which}", ends))
+    return columns
+
+
 def write_csv(table: Table, path: Path) -> None:
     """Write a table as CSV, with numbers in full; what is unknown is empty."""
-    header: list[str] = []
-    has_interval = [any(row[c].interval for row in table.rows) for c in range(len(table.columns))]
-    for column, wide in zip(table.columns, has_interval):
-        title = f"{column.group} {column.name or column.title}".lstrip()
-        header += [title, f"{title} low", f"{title} high"] if wide else [title]
+    names, columns = zip(*columns_of(table))
     with open(path, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(map(csv_cell, header))
-        for row in table.rows:
-            line: list[Any] = []
-            for cell, wide in zip(row, has_interval):
-                line += [cell.value, *(cell.interval or (None, None))] if wide else [cell.value]
-            writer.writerow(map(csv_cell, line))
+        writer.writerow(map(csv_cell, names))
+        writer.writerows(map(csv_cell, line) for line in zip(*columns))
 
 
-def latex_of(table: Table) -> str:
-    """A table in LaTeX, of the package booktabs.
+def write_parquet(table: Table, path: Path) -> None:
+    """Write a table as Parquet, with numbers in full; what is unknown is null."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-    Names are written as they are, in UTF-8, which LaTeX reads by default; where they have letters
-    for which pdflatex has no font, a comment says so.
-    """
-    labels, groups = table.labels, table.groups
-    text = [
-        rf"% {visible(table.caption)}",
-        r"% \usepackage{booktabs}; if it is too wide: \usepackage{adjustbox} and",
-        rf"% \adjustbox{{max width=\linewidth}}{{\input{{{table.name}}}}}",
-        rf"\begin{{tabular}}{{@{{}}{'l' * labels}{'r' * (len(table.columns) - labels)}@{{}}}}",
-        r"\toprule",
-    ]
-    if groups:
-        titles = [rf"\multicolumn{{{n}}}{{c}}{{{tex(title)}}}" for title, n in groups]
-        text.append(" & ".join([*[""] * labels, *titles]) + r" \\")
-        begins = [labels + 1 + sum(n for _, n in groups[:g]) for g in range(len(groups))]
-        text.append("".join(
-            rf"\cmidrule(lr){{{begin}-{begin + n - 1}}}" for begin, (_, n) in zip(begins, groups)
-        ))  # fmt: skip
-    text += [" & ".join(map(tex, table.header)) + r" \\", r"\midrule"]
-    previous = None
-    for row in table.rows:
-        cells = [_ranked(cell) for cell in row]
-        if groups and row[0] == previous:
-            cells[0] = ""
-        elif groups and previous is not None:
-            text.append(r"\midrule")
-        previous = row[0]
-        text.append(" & ".join(cells) + r" \\")
-    if foreign := sorted({c for c in "".join(text) if not _has_font(c)}):
-        text.insert(1, f"% compile with lualatex or xelatex, and a font for {''.join(foreign)}")
-    return "\n".join([*text, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def _has_font(character: str) -> bool:
-    """Whether pdflatex can set a character: Latin 1 and 2, and some punctuation."""
-    return character < "\u0180" or "\u2013" <= character <= "\u2026"
-
-
-def _ranked(cell: Cell) -> str:
-    if cell == UNKNOWN:
-        return "--"
-    marks = ("{}", r"\textbf{{{}}}", r"\underline{{{}}}")
-    return marks[cell.rank].format(tex(cell.text))
-
-
-_TEX = {
-    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\char34{}",
-    "[": "{[}", "*": "{*}", "Δ": r"$\Delta$", "★": r"$\star$", **{c: "\\" + c for c in "&%$#_{}"},
-}  # fmt: skip
-
-
-def tex(text: str) -> str:
-    """Text for LaTeX: what is special there is escaped, and a minus is one.
-
-    So are a star and a bracket, which the end of the line above would take for its own, and no two
-    signs melt into one, as ``--`` and ``?`` with a grave accent would.
-    """
-    escaped = "".join(_TEX.get(c, c) for c in visible(text))
-    minus = re.sub(r"(?<![\w.-])-(?=\d)", "$-$", escaped)
-    return re.sub(r"(?<=[-'`,?!])(?=[-'`,])", "{}", minus)
-
-
-METRIC_LABELS = {
-    "auc": "AUC",
-    "dp20": "DP@20",
-    "norm_dp20": "norm. P",
-    "norm_auc": "norm. AUC",
-    "mauc": "mAUC",
-    "mdp20": "mDP@20",
-    "modelled_auc": "modelled AUC",
-    "modelled_dp20": "modelled DP@20",
-    "modelled_mauc": "modelled mAUC",
-    "modelled_mdp20": "modelled mDP@20",
-}
-
-
-def setting_label(latency: str, scale: float) -> str:
-    """A latency and its scale, such as ``"recorded x 2"``."""
-    return latency if scale == 1 else f"{latency} x {scale:g}"
+    arrays = {}
+    for name, values in columns_of(table):
+        if any(isinstance(value, str) for value in values):
+            values = [None if value is None else visible(value) for value in values]
+        elif any(isinstance(value, float) for value in values):
+            values = [None if value is None else float(value) for value in values]
+        arrays[visible(name)] = pa.array(values)
+    with pa.OSFile(os.fsencode(path), "wb") as sink:
+        pq.write_table(pa.table(arrays), sink)

@@ -60,8 +60,8 @@ def timeline_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Itera
         )
     if any(costs.values()):
         raise LaeError(f"the picture {path} cannot show what forecasters cost: name a .json file")
-    from lae_sim.report.figures import timeline_figure
-    from lae_sim.report.style import save
+    from lae_sim.figures.replay import timeline_figure
+    from lae_sim.figures.style import save
 
     pictures: list[Figure] = []
 

@@ -13,7 +13,8 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.errors import visible
-from lae_sim.report.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
+from lae_sim.figures.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, styled
+from lae_sim.figures.times import draw_times, name_durations
 from lae_sim.report.table import COUNT, Column, Number, Table, text_of
 from lae_sim.trace.describe import InitCost, Report, gathered
 
@@ -215,13 +216,8 @@ def plot_times(found: Sequence[tuple[Report, Sequence[SequenceTimes]]], path: st
     rows = figure.subplots(len(found), 2, squeeze=False, width_ratios=(1, 2))
     for (left, right), (report, sequences) in zip(rows, found):
         times = report["times"]
-        if histogram := times["histogram"]:
-            left.stairs(histogram["counts"], histogram["edges_ms"], fill=True, color=BLUE)
-            outside = histogram["below"] + histogram["above"]
-            left.set_title(f"{outside:,} of {times['calls']['n']:,} calls are outside", fontsize=9)
-            calls = times["calls"]
-            right.set_yscale("log" if calls["max_ms"] > 5 * calls["median_ms"] else "linear")
-        left.set(xlabel="time (ms)", ylabel="calls")
+        if times["histogram"]:
+            draw_times(left, times)
         start = 0
         for number, sequence in enumerate(sequences):
             places = range(start, start := start + len(sequence.elapsed_ns))
@@ -229,6 +225,9 @@ def plot_times(found: Sequence[tuple[Report, Sequence[SequenceTimes]]], path: st
             right.plot(places, ms, ".", ms=1.5, color=colour, rasterized=True)
         order = "as they were run" if times["order_known"] else "in order of their names"
         right.set(xlabel=f"calls, sequences {order}", ylabel="time (ms)")
+        if times["histogram"] and times["calls"]["max_ms"] > 5 * times["calls"]["median_ms"]:
+            right.set(yscale="log", ylabel="time")
+            name_durations(right.yaxis, *right.get_ylim())
         right.axhline(times["frame_interval_ms"], color=VERMILION, ls="--", lw=1)
         right.set_title(f"{report['trace']} (dashed: the interval between frames)", fontsize=9)
     save(figure, path)

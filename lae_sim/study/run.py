@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -23,7 +25,7 @@ from lae_sim.study.deployment import Curve, Search, requirement, searches
 from lae_sim.study.executors import RunAll, at_work, cores, run_here
 from lae_sim.study.pairs import Pairs
 from lae_sim.study.plan import Plan, make_plan, tasks
-from lae_sim.study.records import Comparison, Failure, Record, Requirement, SummaryRow
+from lae_sim.study.records import MEAN, Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
 from lae_sim.study.store import Store
 from lae_sim.study.summary import (
@@ -110,6 +112,20 @@ class StudyResults:
         import pandas as pd
 
         return pd.DataFrame(flat_rows(self.summary))
+
+    def scores_frame(self) -> DataFrame:
+        """The summary with all numbers as numbers.
+
+        World rates and scales are floats, and so is sigma, which is unknown where scores are means
+        over the grid of sigmas; ``over_sigmas`` says so.
+        """
+        table = self.summary_frame()
+        numbers = {
+            name: [float(Fraction(text)) for text in table[name]] for name in ("fps", "scale")
+        }
+        over = table["sigma"] == MEAN
+        sigma = [math.nan if text == MEAN else float(Fraction(text)) for text in table["sigma"]]
+        return table.assign(**numbers, sigma=sigma, over_sigmas=over)
 
     def __repr__(self) -> str:
         cells, failed = len(self.plan.cells), len(self.failures)
@@ -240,14 +256,17 @@ def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathL
         LaeError: if it is, or if a folder stands where a file is to be, or a file for a folder.
     """
     written = [Path(folder, f"{name}.csv") for name in ("summary", "comparisons", "required")]
-    written += [Path(folder, name) for name in ("study.json", "report.html", PAIRS)]
-    tables = Path(folder, "tables")
-    for path in (*written, *tables.glob("*.csv"), *tables.glob("*.tex")):
+    names = ("study.json", "report.html", "contents.json", PAIRS)
+    written += [Path(folder, name) for name in names]
+    folders = [Path(folder, name) for name in ("figures", "tables")]
+    inside = [path for each in folders for path in each.glob("*")]
+    for path in (*written, *(path for path in inside if path.suffix)):
         if path.exists() and not path.is_file():
             raise LaeError(f"{path}: is there already and is not a file: move it away")
-    if tables.exists() and not tables.is_dir():
-        raise LaeError(f"{tables}: is there already and is not a folder: move it away")
-    check_distinct([*written, *tables.glob("*")], inputs)
+    for each in folders:
+        if each.exists() and not each.is_dir():
+            raise LaeError(f"{each}: is there already and is not a folder: move it away")
+    check_distinct([*written, *inside], inputs)
 
 
 def _run(

@@ -229,7 +229,10 @@ def test_help_has_examples_and_names_the_forecasters() -> None:
             marks=pytest.mark.skipif(find_spec("torch") is None, reason="needs torch"),
         ),
         (["--forecaster", "camera+kalman"], "give the dataset's folder with --root"),
-        (["--out", "all.txt"], "--out all.txt: name a .csv or .parquet file"),
+        (
+            ["--out", "all.txt"],
+            "--out all.txt: name a folder (NAME.WITH.POINTS/ ends in /), or a .csv or",
+        ),
         (["--out", "none/all.csv"], "none/all.csv"),
         (["--plot", "all.doc"], "all.doc: name a .png, .svg or .pdf"),
         (["--out", "all.csv", "--plot", "none/all.svg"], "none/all.svg"),

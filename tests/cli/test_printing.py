@@ -112,8 +112,11 @@ def test_all_files_of_a_study_are_utf8_and_safe(folder: Path) -> None:
         *Path("study-results").glob("*.*"),
         *Path("study-results", "tables").iterdir(),
     ]
-    assert {path.suffix for path in written} == {".csv", ".json", ".html", ".tex"}
-    texts = {path.name: path.read_text("utf-8") for path in written}
+    suffixes = {".csv", ".json", ".html", ".tex", ".parquet"}
+    assert {path.suffix for path in written} == suffixes
+    written += Path("study-results", "figures").glob("*.svg")
+    read = [path for path in written if path.suffix != ".parquet"]
+    texts = {path.name: path.read_text("utf-8") for path in read}
     assert all(c.isprintable() or c == "\n" for text in texts.values() for c in text)
     assert f"\n'{SEEN}," in texts["summary.csv"]
     assert SEEN in texts["report.html"]

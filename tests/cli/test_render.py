@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -20,9 +21,9 @@ from lae_sim.datasets.frames import ImageSequence
 from lae_sim.datasets.synthetic import synthetic_dataset
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError
+from lae_sim.figures.film import Scene, colours_of
 from lae_sim.forecast.base import Hold
 from lae_sim.replay.run import replay_sequence
-from lae_sim.report.film import Scene, colours_of
 from lae_sim.trace.file import Trace, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
@@ -110,6 +111,51 @@ def test_frames_that_do_not_exist(scene: Scene) -> None:
             scene.draw(frame)
 
 
+@pytest.fixture(params=["PyAV", "OpenCV"])
+def writer(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """What writes films: PyAV, and OpenCV as if PyAV were not there."""
+    if request.param == "OpenCV":
+        monkeypatch.setitem(sys.modules, "av", None)
+        monkeypatch.setitem(sys.modules, "av.codec", None)
+    else:
+        pytest.importorskip("av", reason="H.264 needs the extra film")
+    return str(request.param)
+
+
+def test_films_are_h264_that_browsers_play(scene: Scene, tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="H.264 needs the extra film")
+    scene.film(tmp_path / "film.mp4")
+    with av.open(str(tmp_path / "film.mp4")) as film:
+        [stream] = film.streams
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert stream.average_rate == 30
+        pictures = [frame.to_ndarray(format="bgr24") for frame in film.decode(stream)]
+    assert len(pictures) == T
+    for frame in (5, 19):
+        drawn = scene.draw(frame)
+        decoded = pictures[frame][: drawn.shape[0], : drawn.shape[1]]
+        assert np.abs(decoded.astype(int) - drawn).mean() < 6
+    head = (tmp_path / "film.mp4").read_bytes()
+    assert head.index(b"moov") < head.index(b"mdat")  # it can be played before it is all there
+
+
+def test_a_film_without_pyav_says_what_h264_needs(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    monkeypatch.setitem(sys.modules, "av.codec", None)
+    arguments = [str(dataset / "trace.parquet"), "--root", str(dataset / "DTB70")]
+    film = dataset / "a.mp4"
+    assert render.main([*arguments, "--sequence", "car", "--out", str(film)]) == 0
+    said = capsys.readouterr().err
+    assert "pip install 'lae-sim[film]' makes them H.264" in said
+    assert said.count("\n") == 1
+    assert len(frames_of(film)) == T
+    assert render.main([*arguments, "--sequence", "car", "--out", str(dataset / "a.png")]) == 0
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("writer")
 def test_a_film_has_every_frame(scene: Scene, tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
     scene.film(path)
@@ -122,6 +168,7 @@ def test_a_film_has_every_frame(scene: Scene, tmp_path: Path) -> None:
     assert [has(frames[5], 90 + 20 * source, ORANGE) for source in (2, 5)] == [True, False]
 
 
+@pytest.mark.usefixtures("writer")
 def test_a_film_appears_whole_or_not_at_all(scene: Scene, tmp_path: Path) -> None:
     def breaks(frame: int) -> np.ndarray:
         if frame == 7:
@@ -134,6 +181,7 @@ def test_a_film_appears_whole_or_not_at_all(scene: Scene, tmp_path: Path) -> Non
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("writer")
 def test_images_that_change_size_are_fitted_into_the_first(scene: Scene, tmp_path: Path) -> None:
     def shrinks(frame: int) -> np.ndarray:
         return np.full((301, 641, 3), 90, np.uint8)[: 100 if frame >= 7 else None]
@@ -160,6 +208,8 @@ def test_a_full_disk(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPat
             if self.left >= 0:
                 self.real.write(picture)
 
+    monkeypatch.setitem(sys.modules, "av", None)
+    monkeypatch.setitem(sys.modules, "av.codec", None)
     real = cv2.VideoWriter
     Full.fourcc = real.fourcc  # type: ignore[attr-defined]
     monkeypatch.setattr(cv2, "VideoWriter", Full)
@@ -194,6 +244,7 @@ def test_options_of_the_world_count(run: Callable[..., str], dataset: Path) -> N
 
 
 def test_a_folder_gets_a_film_of_each_sequence(run: Callable[..., str], dataset: Path) -> None:
+    pytest.importorskip("av", reason="without it the command says so")
     assert not run("films")
     films = sorted((dataset / "films").iterdir())
     assert [film.name for film in films] == ["ball.mp4", "car.mp4"]

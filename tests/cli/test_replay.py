@@ -25,9 +25,9 @@ from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.evaluation.events import KINDS
 from lae_sim.evaluation.metrics import CONVENTIONS, METRICS, success_curve
 from lae_sim.evaluation.modelled import FIGURES
+from lae_sim.figures.replay import sweep_figure
 from lae_sim.forecast import base
 from lae_sim.replay.latency import constant
-from lae_sim.report.figures import sweep_figure
 
 SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
 FAST = REPOSITORY / "traces" / "synthetic-fast.parquet"

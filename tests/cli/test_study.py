@@ -401,13 +401,13 @@ def test_the_tables_and_the_page_say_by_what_they_rank(tmp_path: Path) -> None:
     assert "ranked by the modelled scores: the reach is given or measured" in page
     assert ", of the recorded boxes" in page  # the curves
     ranking = pd.read_csv(tmp_path / "study-results" / "tables" / "ranking.csv")
-    assert ranking["modelled"].is_monotonic_decreasing
-    assert (ranking["modelled low"] < ranking["modelled"]).all()
+    assert ranking["modelled_auc"].is_monotonic_decreasing
+    assert (ranking["modelled_auc_low"] < ranking["modelled_auc"]).all()
     summary = pd.read_csv(tmp_path / "study-results" / "summary.csv")
     best = summary.sort_values("modelled_auc", ascending=False)
-    np.testing.assert_array_equal(ranking["modelled"], best["modelled_auc"])
+    np.testing.assert_array_equal(ranking["modelled_auc"], best["modelled_auc"])
     np.testing.assert_array_equal(
-        ranking["vs hold"].fillna(0), best["vs_hold_modelled_auc"].fillna(0)
+        ranking["vs_hold_auc"].fillna(0), best["vs_hold_modelled_auc"].fillna(0)
     )
     off = study_here(toml(tmp_path, **{**keys, "search": "off"}), *alone, cwd=tmp_path)
     assert "model" not in off
@@ -990,7 +990,16 @@ def test_a_cell_of_other_columns_says_what_to_do(finished: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    "name", ["summary.csv", "study.json", "report.html", "tables/ranking.tex", "tables"]
+    "name",
+    [
+        "summary.csv",
+        "study.json",
+        "report.html",
+        "tables/ranking.tex",
+        "tables",
+        "figures",
+        "contents.json",
+    ],
 )
 def test_what_could_not_be_written_is_said_before_the_work(name: str, tmp_path: Path) -> None:
     run(tmp_path / "study")  # so that it is the folder of a study
@@ -999,7 +1008,7 @@ def test_what_could_not_be_written_is_said_before_the_work(name: str, tmp_path: 
     place = tmp_path / "study" / name
     place.unlink(missing_ok=True)
     place.parent.mkdir(exist_ok=True)
-    if name == "tables":
+    if name in ("tables", "figures"):
         place.write_text("mine")
     else:
         place.mkdir()

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from networks import random_learned
 from places import REPOSITORY
+from schemas import check
 from witness import moving
 
 import lae_sim
@@ -58,6 +59,7 @@ def folder(torch: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_file_names_what_it_was_trained_on_and_how(folder: Path) -> None:
     told = json.loads((folder / "told.json").read_text())
+    check(told, "train")
     seen = [name for name in NAMES if name not in ("car-chase", "boat-calm", "truck-far")]
     assert told.pop("forecaster") == "f.npz"
     found = read_learned(folder / "f.npz")
@@ -125,6 +127,7 @@ def test_made_up_motion_trains_the_same_network_again(
         command = ["--made-up", "8", "--steps", "2", "--seed", seed, "--out", str(out), "--json"]
         assert main(command) == 0
         told = json.loads(capsys.readouterr().out)
+        check(told, "train")
         digests.append((told["digest"], out.read_bytes()))
     assert digests[0] == digests[1]
     assert digests[0][0] != digests[2][0]

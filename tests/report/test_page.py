@@ -16,12 +16,12 @@ import pytest
 from nasty import NASTY, nasty_traces
 
 from lae_sim.evaluation.metrics import CONVENTIONS
-from lae_sim.report import study_figures
+from lae_sim.figures import study as study_figures
 from lae_sim.report.page import convention_in_words, page, page_file, write_report
-from lae_sim.report.study_view import View
 from lae_sim.study.records import Failure
 from lae_sim.study.run import compute_study, flat_rows
 from lae_sim.study.spec import Study
+from lae_sim.study.view import View
 
 VOID = {"meta", "img", "br"}
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from lae_sim.boxes import search_side
+from lae_sim.figures.style import save
 from lae_sim.report.reach import ReachReport, _wilson, reach_figure
-from lae_sim.report.style import save
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording

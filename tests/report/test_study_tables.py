@@ -12,9 +12,10 @@ import pytest
 from nasty import nasty_traces
 
 from lae_sim.errors import visible
+from lae_sim.figures.study import Point, _front, _gains, front
 from lae_sim.replay.world import SIGMA_GRID
+from lae_sim.report.latex import latex_of
 from lae_sim.report.page import page
-from lae_sim.report.study_figures import Point, _front, _gains, front
 from lae_sim.report.study_tables import (
     comparison_table,
     ranking,
@@ -23,12 +24,12 @@ from lae_sim.report.study_tables import (
     table2,
     write_tables,
 )
-from lae_sim.report.study_view import View, run_of, setting_of
-from lae_sim.report.table import Cell, Column, Table, latex_of, tex, text_of
+from lae_sim.report.table import text_of
 from lae_sim.study.records import MEAN
 from lae_sim.study.run import StudyResults, compute_study, flat_rows
 from lae_sim.study.spec import Study
 from lae_sim.study.verdict import device_in_words
+from lae_sim.study.view import View, run_of, setting_of
 
 
 @pytest.fixture(scope="module")
@@ -207,52 +208,13 @@ def test_files(results, tmp_path):
     write_tables(results, tmp_path / "new" / "tables")
     names = {"ranking", "table2", "attributes", "comparisons", "required"}
     files = {path.name for path in (tmp_path / "new" / "tables").iterdir()}
-    assert files == {f"{name}.{kind}" for name in names for kind in ("csv", "tex")}
+    kinds = (".csv", ".parquet", ".tex", "-long.tex")
+    assert files == {f"{name}{kind}" for name in names for kind in kinds}
     with open(tmp_path / "new" / "tables" / "ranking.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["tracker"].count("<script>") for row in rows} == {1}
-    assert float(rows[0]["AUC low"]) <= float(rows[0]["AUC"]) <= float(rows[0]["AUC high"])
-    text = (tmp_path / "new" / "tables" / "ranking.tex").read_text()
+    assert float(rows[0]["auc_low"]) <= float(rows[0]["auc"]) <= float(rows[0]["auc_high"])
+    text = (tmp_path / "new" / "tables" / "ranking-long.tex").read_text()
     body = [line for line in text.splitlines() if not line.startswith("%")]
-    assert all(line.count(r"\&") == 2 for line in body if "script" in line)
+    assert all(line.count(r"\&") == 1 for line in body if "script" in line)
     assert len([line for line in body if line.endswith(r" \\")]) == 1 + 4  # scale 1 alone
-
-
-def test_golden_latex():
-    rows = (
-        (Cell("A_1", "A_1"), Cell("hold", "hold"), Cell("0.512", 0.512, rank=2)),
-        (Cell("A_1", "A_1"), Cell("kalman", "kalman"), Cell("-0.6%", -0.6, rank=1)),
-        (Cell("B", "B"), Cell("hold", "hold"), Cell("-", None)),
-    )
-    columns = (
-        Column("tracker", str, is_label=True),
-        Column("f", str, is_label=True),
-        Column("Δ", str, group="D&D"),
-    )
-    table = Table("t", "What 50% is", columns, rows)
-    assert latex_of(table) == "\n".join([
-        "% What 50% is",
-        r"% \usepackage{booktabs}; if it is too wide: \usepackage{adjustbox} and",
-        r"% \adjustbox{max width=\linewidth}{\input{t}}",
-        r"\begin{tabular}{@{}llr@{}}",
-        r"\toprule",
-        r" &  & \multicolumn{1}{c}{D\&D} \\",
-        r"\cmidrule(lr){3-3}",
-        r"tracker & f & $\Delta$ \\",
-        r"\midrule",
-        r"A\_1 & hold & \underline{0.512} \\",
-        r" & kalman & \textbf{$-$0.6\%} \\",
-        r"\midrule",
-        r"B & hold & -- \\",
-        r"\bottomrule",
-        r"\end{tabular}",
-        "",
-    ])  # fmt: skip
-
-
-def test_latex_escapes():
-    assert tex("a_b & 50% #1 $x$ {~^\\}") == (
-        r"a\_b \& 50\% \#1 \$x\$ \{\textasciitilde{}\textasciicircum{}\textbackslash{}\}"
-    )
-    assert tex("x\ny\x00") == r"x\textbackslash{}ny\textbackslash{}x00"
-    assert tex("DTB70-ECO 0.1 [-0.2, -3]") == "DTB70-ECO 0.1 {[}$-$0.2, $-$3]"

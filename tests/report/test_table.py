@@ -1,4 +1,4 @@
-"""One table, four ways to show it: that they say the same, and what a column makes of a record."""
+"""One table, several ways to show it: they say the same; what a column makes of a record."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import csv
 from dataclasses import dataclass
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from lae_sim.files import csv_cell
@@ -18,12 +20,12 @@ from lae_sim.report.table import (
     Column,
     Number,
     Table,
-    latex_of,
     legend_of,
     p_label,
     relative_change,
     text_of,
     write_csv,
+    write_parquet,
 )
 
 
@@ -71,45 +73,38 @@ def test_csv_has_numbers_in_full(tmp_path: Path) -> None:
     write_csv(TABLE, tmp_path / "t.csv")
     with open(tmp_path / "t.csv", newline="") as file:
         header, first, second = csv.reader(file)
-    assert header == ["tracker", "AUC", "AUC low", "AUC high", "lost"]
+    assert header == ["name", "auc", "auc_low", "auc_high", "lost"]
     assert first == ["slow\n", "0.51249", "0.4", "0.6", str(0.51249 - 1)]
     assert second == ["fast & rough", "", "", "", ""]
 
 
-def test_latex_escapes_names_and_signs() -> None:
-    lines = latex_of(TABLE).splitlines()
-    assert lines[0] == "% What there is"
-    assert r"slow\textbackslash{}n & 0.512 {[}0.400, 0.600] & $-$48.8\% \\" in lines
-    assert r"fast \& rough & -- & -- \\" in lines
+def test_parquet_says_what_csv_says_in_numbers(tmp_path: Path) -> None:
+    write_csv(TABLE, tmp_path / "t.csv")
+    write_parquet(TABLE, tmp_path / "t.parquet")
+    stored = pq.read_table(tmp_path / "t.parquet")
+    with open(tmp_path / "t.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert stored.column_names == list(rows[0])
+    assert stored.schema.field("auc").type == pa.float64()
+    for name in ("auc", "auc_low", "auc_high", "lost"):
+        values = [None if row[name] == "" else float(row[name]) for row in rows]
+        assert stored[name].to_pylist() == values
+    assert stored["name"].to_pylist() == [r"slow\n", "fast & rough"]
 
 
-@pytest.mark.parametrize(
-    ("name", "written"),
-    [
-        ("*", "{*}"),  # the star of the line break before it
-        ("[x]", "{[}x]"),  # its optional argument
-        ("?`", "?{}`"),  # a ligature for the Spanish question mark
-        ("!`a``b", "!{}`a`{}`b"),
-        ("--", "-{}-"),
-        ("a---b", "a-{}-{}-b"),
-        ("-", "-"),
-        ("it''s", "it'{}'s"),
-        ("\\", r"\textbackslash{}"),
-        ('a<b>|c"', r"a\textless{}b\textgreater{}\textbar{}c\char34{}"),
-        ("Müller", "Müller"),
-    ],
-)
-def test_latex_holds_hostile_names(name: str, written: str) -> None:
-    table = Table.of(COLUMNS[:2], [Tracker(name, None)], "t")
-    lines = latex_of(table).splitlines()
-    assert rf"{written} & -- \\" in lines
-    assert not any(line.startswith("% compile") for line in lines)
+def test_whole_numbers_stay_whole_in_parquet(tmp_path: Path) -> None:
+    columns = [Column("n", "n"), Column("none at all", "m")]
+    write_parquet(Table.of(columns, [{"n": 3}, {"n": None}]), tmp_path / "t.parquet")
+    stored = pq.read_table(tmp_path / "t.parquet")
+    assert stored.to_pydict() == {"n": [3, None], "m": [None, None]}
+    assert stored.schema.field("n").type == pa.int64()
 
 
-def test_latex_says_what_pdflatex_has_no_font_for() -> None:
-    text = latex_of(Table.of(COLUMNS[:1], [Tracker("追踪", 1.0)], "t"))
-    assert "% compile with lualatex or xelatex, and a font for 踪追" in text.splitlines()
-    assert r"追踪 \\" in text.splitlines()
+def test_a_table_of_some_columns() -> None:
+    some = TABLE.only(lambda place, column: column.is_label or place == 2)
+    assert some.header == ("tracker", "lost")
+    assert [row[0] for row in some.rows] == [row[0] for row in TABLE.rows]
+    assert [row[1] for row in some.rows] == [row[2] for row in TABLE.rows]
 
 
 def test_csv_has_no_formulas(tmp_path: Path) -> None:

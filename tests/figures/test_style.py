@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from lae_sim.learning.registry import BUILT_IN
-from lae_sim.report.film import colours_of
-from lae_sim.report.style import (
+from lae_sim.figures.film import colours_of
+from lae_sim.figures.style import (
     forecaster_colours,
     forecaster_lines,
     forecaster_styles,
     tracker_styles,
 )
+from lae_sim.learning.registry import BUILT_IN
 
 NAMES = [*BUILT_IN, "trained", "tuned-kalman"]
 

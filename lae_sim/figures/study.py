@@ -6,9 +6,10 @@ there are no trackers to tell apart. Pictures that would hold too much choose, a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,13 +17,19 @@ import numpy as np
 from lae_sim.comparison.statistics import ALL_TRACES, Interval
 from lae_sim.engine.clock import parse_duration, split_init
 from lae_sim.errors import visible
-from lae_sim.replay.search import ReachRange, parse_search
-from lae_sim.report.figures import Curve, Line, Panel, draw_curves, draw_sweep
-from lae_sim.report.study_view import SETTINGS, View, run_of, score_name, setting_of, shared_setting
-from lae_sim.report.style import (
-    BLUE,
+from lae_sim.figures.column import ColumnFigure, column_figure
+from lae_sim.figures.forecasters import attribute_bars, attributes_in_columns, recovers
+from lae_sim.figures.lines import (
+    Curve,
+    Line,
+    Panel,
+    curves_in_column,
+    draw_curves,
+    draw_sweep,
+    panel_in_column,
+)
+from lae_sim.figures.style import (
     GREY,
-    VERMILION,
     Style,
     forecaster_lines,
     forecaster_styles,
@@ -33,12 +40,16 @@ from lae_sim.report.style import (
     svg_of,
     tracker_styles,
 )
-from lae_sim.study.records import SummaryRow
+from lae_sim.figures.times import draw_times
+from lae_sim.replay.search import ReachRange, parse_search
+from lae_sim.study.records import SummaryRow, Uncertainty
 from lae_sim.study.summary import Scores
+from lae_sim.study.view import SETTINGS, View, run_of, score_name, setting_of, shared_setting
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 MOST_CURVES, MOST_PAIRS, MOST_BARS, MOST_HISTOGRAMS = 8, 6, 30, 30
 """What one picture holds of curves, rows and histograms, and how many curve pictures there are."""
@@ -90,24 +101,32 @@ def _best_runs(view: View, rows: Sequence[SummaryRow]) -> tuple[list[str], str]:
 
 def curves(view: View) -> Iterator[Picture]:
     """Success and precision of each dataset, at the settings that stand for all, then others."""
+    groups = _curve_groups(view)
+    for scores, left_out in groups[:MOST_PAIRS]:
+        rows = [view.row_of(each) for each in scores]
+        yield Picture(
+            f"{visible(rows[0].dataset)}: {_recorded(rows)}{left_out}. In brackets: AUC, "
+            "and precision at 20 px.",
+            svg_of(draw_curves([curve for each in scores for curve in _curves(view, each)])),
+        )
+    if len(groups) > MOST_PAIRS:
+        left = len(groups) - MOST_PAIRS
+        yield Picture(f"{left} more settings are in the ranking, and not drawn here.", b"")
+
+
+def _curve_groups(view: View) -> list[tuple[list[Scores], str]]:
+    """Scores whose curves are drawn together, and what was left out; what stands for all first."""
     groups: dict[tuple[Any, ...], list[Scores]] = {}
     for scores in view.results.scores:
         groups.setdefault(scores.group, []).append(scores)
     ordered = sorted(
         groups.values(), key=lambda group: not any(view.stands(view.row_of(s)) for s in group)
     )
-    for group in ordered[:MOST_PAIRS]:
+    chosen = []
+    for group in ordered:
         kept, left_out = _best_runs(view, [view.row_of(scores) for scores in group])
-        shown = [scores for scores in group if scores.setting.run in kept]
-        rows = [view.row_of(scores) for scores in shown]
-        yield Picture(
-            f"{visible(rows[0].dataset)}: {_recorded(rows)}{left_out}. In brackets: AUC, "
-            "and precision at 20 px.",
-            svg_of(draw_curves([curve for scores in shown for curve in _curves(view, scores)])),
-        )
-    if len(ordered) > MOST_PAIRS:
-        left = len(ordered) - MOST_PAIRS
-        yield Picture(f"{left} more settings are in the ranking, and not drawn here.", b"")
+        chosen.append(([scores for scores in group if scores.setting.run in kept], left_out))
+    return chosen
 
 
 def _recorded(rows: Sequence[SummaryRow]) -> str:
@@ -143,6 +162,12 @@ SWEEPS = {
 
 def sweep(view: View, key: str) -> Picture | None:
     """AUC and DP of each dataset over a key of ``SWEEPS``; None if it has one value only."""
+    caption, panels = _sweep(view, key)
+    return Picture(caption, svg_of(draw_sweep(panels, 2, sharex=True))) if panels else None
+
+
+def _sweep(view: View, key: str) -> tuple[str, list[Panel]]:
+    """The caption and the panels of a sweep, AUC and DP by turns; none of one value only."""
     varied = "latency" if key == "init" else key  # whose name says the initialisation
     points: list[tuple[float, SummaryRow]] = []
     for row in view.results.summary if key == "sigma" else view.rows:
@@ -152,7 +177,7 @@ def sweep(view: View, key: str) -> Picture | None:
         if x is not None and all(own == chosen[name] for name, own in settings if name != varied):
             points.append((x, row))
     if len({x for x, _ in points}) < 2:
-        return None
+        return "", []
     caption = f"Over {SWEEPS[key].split(' (')[0]}: {shared_setting(view.standing, but=varied)}"
     panels: list[Panel] = []
     for dataset in dict.fromkeys(row.dataset for _, row in points):
@@ -161,7 +186,7 @@ def sweep(view: View, key: str) -> Picture | None:
         caption += left_out and f"{left_out} on {_short(dataset)}"
         shown = [(x, row) for x, row in within if run_of(row) in kept]
         panels += _sweep_panels(view, _short(dataset), shown, key)
-    return Picture(caption, svg_of(draw_sweep(panels, 2, sharex=True)))
+    return caption, panels
 
 
 def _place(row: SummaryRow, key: str, chosen: str) -> float | None:
@@ -209,19 +234,26 @@ def _sweep_panels(
 
 def front(view: View) -> Picture | None:
     """AUC against the time of a call, and the Pareto front of each dataset and forecaster."""
-    points = [
+    points = _points(view)
+    if not points:
+        return None
+    return Picture(_front_caption(points), svg_of(_front(view, points)))
+
+
+def _points(view: View) -> list[Point]:
+    return [
         Point(row, row.elapsed_ms, auc)
         for row in view.standing
         if row.elapsed_ms is not None and (auc := row.score("auc")) is not None
     ]
-    if not points:
-        return None
+
+
+def _front_caption(points: Sequence[Point]) -> str:
     rows = [point.row for point in points]
-    caption = (
+    return (
         f"{score_name('AUC', rows)} against the mean time of a call; hollow: hold; lines join what "
         f"no other tracker beats in both: {shared_setting(rows)}"
     )
-    return Picture(caption, svg_of(_front(view, points)))
 
 
 @dataclass(frozen=True)
@@ -238,25 +270,31 @@ def _front(view: View, points: Sequence[Point]) -> Figure:
     datasets = list(dict.fromkeys(point.row.dataset for point in points))
     columns = min(len(datasets), 2)
     figure, panels = panel_grid(len(datasets), columns, 10 / columns, 3.6)
-    styles, lines = _styles(view), forecaster_lines(view.forecasters)
     for axes, dataset in zip(panels, datasets):
         within = [point for point in points if point.row.dataset == dataset]
-        for forecaster in view.forecasters:
-            best = [p for p in within if p.row.forecaster == forecaster and p.row.pareto]
-            best.sort(key=lambda point: point.ms)
-            style = {"color": GREY, "linestyle": lines[forecaster], "zorder": 1}
-            xs, ys = [point.ms for point in best], [point.auc for point in best]
-            axes.plot(xs, ys, label=f"front, {_short(forecaster)}", **style)
-        for point in within:
-            filled = "full" if point.row.forecaster != "hold" else "none"
-            style = {**styles[run_of(point.row), "hold"], "linestyle": "", "fillstyle": filled}
-            axes.plot(point.ms, point.auc, **{**style, "markersize": 7})
-        axes.margins(x=0.2, y=0.1)
-        _name_trackers(axes, view, within)
-        name = score_name("AUC", [point.row for point in points])
-        axes.set(xlabel="mean time of a call (ms)", ylabel=name, title=_short(dataset))
+        _draw_front(axes, view, within)
+        axes.set_title(_short(dataset))
     legend_below(figure)
     return figure
+
+
+def _draw_front(axes: Axes, view: View, points: Sequence[Point]) -> None:
+    """The points of one dataset, and the front of each forecaster."""
+    styles, lines = _styles(view), forecaster_lines(view.forecasters)
+    for forecaster in view.forecasters:
+        best = [p for p in points if p.row.forecaster == forecaster and p.row.pareto]
+        best.sort(key=lambda point: point.ms)
+        style = {"color": GREY, "linestyle": lines[forecaster], "zorder": 1}
+        xs, ys = [point.ms for point in best], [point.auc for point in best]
+        axes.plot(xs, ys, label=f"front, {_short(forecaster)}", **style)
+    for point in points:
+        filled = "full" if point.row.forecaster != "hold" else "none"
+        style = {**styles[run_of(point.row), "hold"], "linestyle": "", "fillstyle": filled}
+        axes.plot(point.ms, point.auc, **{**style, "markersize": 7})
+    axes.margins(x=0.2, y=0.1)
+    _name_trackers(axes, view, points)
+    name = score_name("AUC", [point.row for point in points])
+    axes.set(xlabel="mean time of a call (ms)", ylabel=name)
 
 
 def _name_trackers(axes: Axes, view: View, points: Sequence[Point]) -> None:
@@ -281,52 +319,93 @@ def _name_trackers(axes: Axes, view: View, points: Sequence[Point]) -> None:
 
 def gains(view: View) -> Picture | None:
     """What each forecaster wins over hold for each tracker; None if there is only hold."""
+    caption, rows, runs = _gaining(view)
+    return Picture(caption, svg_of(_gains(view, rows, runs))) if runs else None
+
+
+def _gaining(view: View) -> tuple[str, list[SummaryRow], list[str]]:
+    """A caption, the rows and the runs of the largest gains; nothing if there is only hold."""
     best: dict[str, float] = {}
     for row in view.standing:
         if (sure := row.certainty("auc")) and (won := sure.vs_hold) is not None:
             best[run_of(row)] = max(best.get(run_of(row), -1), won.value)
     if not best:
-        return None
+        return "", [], []
     kept = sorted(best, key=lambda run: -best[run])[:MOST_BARS]
     left_out = f", the {len(kept)} largest of {len(best)}" if len(kept) < len(best) else ""
     caption = f"What forecasters win over hold{left_out}, with 95 % intervals over sequences"
     rows = [row for row in view.standing if run_of(row) in kept]
-    return Picture(f"{caption}: {shared_setting(rows)}", svg_of(_gains(view, rows, kept)))
+    return f"{caption}: {shared_setting(rows)}", rows, kept
 
 
 @styled
 def _gains(view: View, rows: Sequence[SummaryRow], runs: Sequence[str]) -> Figure:
-    rivals = [name for name in view.forecasters if name != "hold"]
-    figure = new_figure(10, 1.3 + 0.3 * len(runs) + 0.1 * len(runs) * len(rivals))
+    rivals = len(view.forecasters) - 1
+    figure = new_figure(10, 1.3 + 0.3 * len(runs) + 0.1 * len(runs) * rivals)
     panels = figure.subplots(1, 2, sharey=True)
+    for axes, draw in zip(panels, (_draw_won, _draw_recovered)):
+        draw(axes, view, rows, runs)
+    legend_below(figure)
+    return figure
+
+
+Gain = Callable[[Uncertainty], tuple[float, Interval | None] | None]
+"""What a row gains, and its interval; None where it is not known."""
+
+
+def _draw_won(axes: Axes, view: View, rows: Sequence[SummaryRow], runs: Sequence[str]) -> None:
+    """The score won over hold."""
+
+    def won(uncertainty: Uncertainty) -> tuple[float, Interval | None] | None:
+        gain = uncertainty.vs_hold
+        return None if gain is None else (gain.value, gain.interval)
+
+    _draw_gains(axes, view, rows, runs, won)
+    axes.set_xlabel(f"{score_name('AUC', rows)} won over hold")
+
+
+def _draw_recovered(
+    axes: Axes, view: View, rows: Sequence[SummaryRow], runs: Sequence[str]
+) -> None:
+    """The share of the loss won back."""
+
+    def share(uncertainty: Uncertainty) -> tuple[float, Interval | None] | None:
+        gain = uncertainty.recovered
+        return None if gain is None or gain.share is None else (gain.share, gain.interval)
+
+    _draw_gains(axes, view, rows, runs, share, 100)
+    axes.set_xlabel("latency loss recovered (%)")
+    low, high = axes.get_xlim()
+    axes.set_xlim(max(low, -100), min(high, 150))  # where little was lost, intervals are wide
+
+
+def _draw_gains(
+    axes: Axes,
+    view: View,
+    rows: Sequence[SummaryRow],
+    runs: Sequence[str],
+    gain: Gain,
+    factor: float = 1,
+) -> None:
+    rivals = [name for name in view.forecasters if name != "hold"]
     styles = forecaster_styles(view.forecasters)
     datasets = {run_of(row): _short(row.dataset) for row in rows}
     several = len(set(datasets.values())) > 1
-    for axes in panels:
-        axes.axvline(0, color=GREY, linewidth=0.8)
+    axes.axvline(0, color=GREY, linewidth=0.8)
     for forecaster in rivals:
         style = {**styles[forecaster], "linestyle": "", "label": _short(forecaster)}
         aside = 0.7 * ((rivals.index(forecaster) + 0.5) / len(rivals) - 0.5)
         for row in rows:
             uncertainty = row.certainty("auc") if row.forecaster == forecaster else None
-            if uncertainty is None or uncertainty.vs_hold is None:
-                continue
-            y = runs.index(run_of(row)) + aside
-            won, recovered = uncertainty.vs_hold, uncertainty.recovered
-            _dot(panels[0], y, won.value, won.interval, style)
-            if recovered is not None and recovered.share is not None:
-                _dot(panels[1], y, recovered.share, recovered.interval, style, 100)
-    name = score_name("AUC", rows)
-    panels[0].set(xlabel=f"{name} won over hold", ylim=(len(runs) - 0.5, -0.5))
-    panels[1].set(xlabel="latency loss recovered (%)")
-    low, high = panels[1].get_xlim()
-    panels[1].set_xlim(max(low, -100), min(high, 150))  # where little was lost, intervals are wide
-    panels[0].set_yticks(
+            found = None if uncertainty is None else gain(uncertainty)
+            if found is not None:
+                value, interval = found
+                _dot(axes, runs.index(run_of(row)) + aside, value, interval, style, factor)
+    axes.set_ylim(len(runs) - 0.5, -0.5)
+    axes.set_yticks(
         range(len(runs)),
         [_short(view.names[r]) + (f" ({datasets[r]})" if several else "") for r in runs],
     )
-    legend_below(figure)
-    return figure
 
 
 def _dot(
@@ -341,21 +420,22 @@ def _dot(
 
 def attributes(view: View) -> Iterator[Picture]:
     """Gains on the sequences of each attribute, all trackers of a dataset together."""
-    from lae_sim.report.forecaster_figures import attribute_bars
-
-    if view.attributes is None:
-        return
-    for dataset, group in view.attributes.groupby("dataset", sort=False):
-        pooled = group[group["trace"] == ALL_TRACES]
-        shown = group if pooled.empty else pooled
-        is_recovered = shown["recovered"].notna().any()
-        figure = attribute_bars(shown, "auc", "recovered" if is_recovered else "mean")
+    for dataset, rows in _attribute_rows(view):
+        is_recovered = recovers(rows)
         what = "share of the latency loss recovered" if is_recovered else "AUC"
         yield Picture(
             f"{dataset}: {what} on the sequences of each attribute (n of them), with 95 % "
             "intervals where they are known; at the first sigma",
-            svg_of(figure),
+            svg_of(attribute_bars(rows, "auc", "recovered" if is_recovered else "mean")),
         )
+
+
+def _attribute_rows(view: View) -> Iterator[tuple[str, DataFrame]]:
+    """Each dataset that has attributes, and what is drawn of it."""
+    if view.attributes is not None:
+        for dataset, group in view.attributes.groupby("dataset", sort=False):
+            pooled = group[group["trace"] == ALL_TRACES]
+            yield str(dataset), group if pooled.empty else pooled
 
 
 def histograms(view: View) -> Picture | None:
@@ -367,20 +447,66 @@ def histograms(view: View) -> Picture | None:
     left_out = ""
     if len(shown) < len(traces):
         left_out = f"; the first {len(shown)} of {len(traces)} traces"
-    caption = f"Times of the calls; dashed: the interval between frames{left_out}"
+    caption = (
+        "Times of the calls: the area of a bar is its share of the calls; dashed: the interval "
+        f"between frames; marks: stalls{left_out}"
+    )
     return Picture(caption, svg_of(_histograms(shown)))
 
 
 @styled
 def _histograms(traces: Sequence[Mapping[str, Any]]) -> Figure:
-    figure, panels = panel_grid(len(traces), 3, 10 / 3, 1.9)
+    figure, panels = panel_grid(len(traces), 3, 10 / 3, 2.1)
     for axes, trace in zip(panels, traces):
-        times, interval = trace["times"], trace["times"]["frame_interval_ms"]
-        counts, edges = times["histogram"]["counts"], times["histogram"]["edges_ms"]
-        axes.stairs(counts, edges, fill=True, color=BLUE)
+        draw_times(axes, trace["times"])
         axes.set_title(_short(trace["trace"]), fontsize=8)
-        outside = times["histogram"]["below"] + times["histogram"]["above"]
-        axes.set_xlabel(f"ms ({outside:,} of {times['calls']['n']:,} calls outside)")
-        if edges[0] < interval < edges[-1]:
-            axes.axvline(interval, color=VERMILION, linestyle="--", linewidth=1)
     return figure
+
+
+def study_in_columns(view: View) -> Iterator[ColumnFigure]:
+    """The figures of a study for a paper, at the settings that stand for all."""
+    for scores, left_out in _curve_groups(view):
+        rows = [view.row_of(each) for each in scores]
+        if not any(map(view.stands, rows)):
+            break
+        caption = f"on {visible(rows[0].dataset)}: {_recorded(rows)}{left_out}"
+        curves = [curve for each in scores for curve in _curves(view, each)]
+        success, precision = curves_in_column(curves)
+        name = rows[0].dataset
+        yield ColumnFigure(f"success-{name}", f"Success {caption}. In brackets: AUC.", success)
+        yield ColumnFigure(
+            f"precision-{name}",
+            f"Precision {caption}. In brackets: precision at 20 px.",
+            precision,
+        )
+    for key in SWEEPS:
+        caption, panels = _sweep(view, key)
+        for panel in panels:
+            name = f"{panel.ylabel.lower()}-over-{key}-{panel.title}"
+            figure = panel_in_column(panel)
+            yield ColumnFigure(name, f"{panel.ylabel} on {panel.title}. {caption}", figure)
+    points = _points(view)
+    for dataset in dict.fromkeys(point.row.dataset for point in points):
+        within = [point for point in points if point.row.dataset == dataset]
+        yield ColumnFigure(
+            f"front-{dataset}",
+            f"{visible(dataset)}: {_front_caption(within)}",
+            column_figure(partial(_draw_front, view=view, points=within), 2.4),
+        )
+    caption, rows, runs = _gaining(view)
+    height = 0.5 + len(runs) * (0.13 + 0.06 * (len(view.forecasters) - 1))
+    if runs:
+        won = column_figure(partial(_draw_won, view=view, rows=rows, runs=runs), height)
+        yield ColumnFigure("won", caption, won)
+        share = column_figure(partial(_draw_recovered, view=view, rows=rows, runs=runs), height)
+        yield ColumnFigure("recovered", f"Share of the loss won back. {caption}", share)
+    for dataset, group in _attribute_rows(view):
+        yield from attributes_in_columns(group, "auc", dataset)
+    for trace in view.results.traces:
+        if trace["times"]["histogram"]:
+            yield ColumnFigure(
+                f"times-{trace['trace']}",
+                f"Times of the calls of {visible(trace['trace'])}: the area of a bar is its share "
+                "of the calls; dashed: the interval between frames; marks: stalls",
+                column_figure(partial(draw_times, times=trace["times"]), 1.6),
+            )

@@ -97,6 +97,13 @@ def forecaster_lines(names: Iterable[str]) -> dict[str, Any]:
     return {**fixed, **{name: _LINES[i % len(_LINES)] for i, name in enumerate(others)}}
 
 
+def paper_styles(names: Iterable[str]) -> dict[str, Style]:
+    """Colour, marker and line of each forecaster, which differ in grey print too."""
+    names = list(names)
+    styles, lines = forecaster_styles(names), forecaster_lines(names)
+    return {name: {**styles[name], "linestyle": lines[name]} for name in names}
+
+
 def tracker_styles(names: Iterable[str]) -> dict[str, Style]:
     """Colour and marker of each tracker (or trace) of a report."""
     n = len(_TRACKERS)
@@ -188,7 +195,7 @@ def check_format(path: str) -> None:
 
 
 @contextmanager
-def _any_names(figure: Figure) -> Iterator[None]:
+def any_names(figure: Figure) -> Iterator[None]:
     """Let a figure hold names in any letters, those that its font lacks as boxes."""
     from matplotlib.text import Text
 
@@ -206,7 +213,7 @@ def save(figure: Figure, path: str) -> None:
         LaeError: if it cannot be written, or the ending is not known.
     """
     check_format(path)
-    with written_whole(path) as temporary, _any_names(figure):
+    with written_whole(path) as temporary, any_names(figure):
         figure.savefig(temporary, format=Path(path).suffix[1:].lower(), dpi=150)
 
 
@@ -216,6 +223,6 @@ def svg_of(figure: Figure) -> bytes:
 
     file = io.BytesIO()
     settings: dict[Any, Any] = {"svg.hashsalt": "lae_sim", "svg.fonttype": "none"}
-    with matplotlib.rc_context(settings), _any_names(figure):
+    with matplotlib.rc_context(settings), any_names(figure):
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
     return file.getvalue()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +16,7 @@ from lae_sim._arrays import Floats
 from lae_sim.boxes import iou
 from lae_sim.datasets.frames import Image
 from lae_sim.errors import LaeError
-from lae_sim.report.style import forecaster_colours
+from lae_sim.figures.style import forecaster_colours
 
 if TYPE_CHECKING:
     from lae_sim.datasets.frames import ImageSequence
@@ -142,6 +144,62 @@ def _line(items: Sequence[tuple[str, Colour]], width: int) -> Image:
     return band
 
 
+def writes_h264() -> bool:
+    """Whether films are H.264: whether PyAV is there, with its encoder."""
+    try:
+        from av.codec import codecs_available
+    except ImportError:
+        return False
+    return "libx264" in codecs_available
+
+
+Writer = Iterator[Callable[[Image], object]]
+"""Gives a function that adds a picture to a film, uint8 [H, W, 3] of even sides."""
+
+
+@contextmanager
+def _h264(path: Path, fps: Fraction, width: int, height: int) -> Writer:
+    """Write H.264 with PyAV, in the pixel format that all players take."""
+    import av
+
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream(
+            "libx264", fps.limit_denominator(10**6), options={"crf": "20", "threads": "1"}
+        )
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+
+        def write(picture: Image) -> None:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+
+        yield write
+        container.mux(stream.encode(None))
+
+
+@contextmanager
+def _mpeg4(path: Path, fps: Fraction, width: int, height: int) -> Writer:
+    """Write MPEG-4 Part 2 with OpenCV, which says of nothing that it failed."""
+    import cv2
+
+    log = cv2.utils.logging
+    level = log.getLogLevel()
+    log.setLogLevel(log.LOG_LEVEL_ERROR)  # it warns of each frame that it cannot write
+    writer = cv2.VideoWriter(
+        str(path), cv2.VideoWriter.fourcc(*"mp4v"), float(fps), (width, height)
+    )
+    try:
+        yield writer.write
+    finally:
+        writer.release()
+        log.setLogLevel(level)
+
+
+def frames_in(path: Path) -> int:
+    """The number of frames that a film says it has; 0 if it cannot be read."""
+    import cv2
+
+    return max(0, int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)))
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A replayed sequence with its frames: ``scene.draw(frame)`` is a picture of one.
@@ -193,7 +251,7 @@ class Scene:
         return cls(run, images, found)
 
     def draw(self, frame: int, width: int | None = None) -> Image:
-        """Draw the boxes for a world frame on it; see `lae_sim.report.film.draw_frame`.
+        """Draw the boxes for a world frame on it; see `lae_sim.figures.film.draw_frame`.
 
         Raises:
             LaeError: if there is no such frame, or it cannot be read.
@@ -215,40 +273,32 @@ class Scene:
     def film(self, path: str | Path) -> None:
         """Write an MP4 of all frames, whole or not at all, with a progress bar on a terminal.
 
-        It shows as many frames a second as the world does, whenever each of them arrived.
+        It shows as many frames a second as the world does, whenever each of them arrived. It is
+        H.264, which browsers play, if PyAV is there (``pip install 'lae-sim[film]'``), and MPEG-4
+        Part 2 by OpenCV otherwise.
 
         Raises:
             LaeError: if it cannot be written, or a frame cannot be read.
         """
-        import cv2
-        import numpy as np
-
         from lae_sim.files import written_whole
         from lae_sim.progress import ProgressBar
 
         first = self.draw(0)
         fill = [(0, side % 2) for side in first.shape[:2]] + [(0, 0)]  # codecs need even sides
         height, width = np.pad(first, fill).shape[:2]
-        fourcc, rate = cv2.VideoWriter.fourcc(*"mp4v"), float(self.run.schedule.clock.fps)
+        writer = _h264 if writes_h264() else _mpeg4
         bar = ProgressBar(Path(path).name, "frames")
-        log = cv2.utils.logging
-        level = log.getLogLevel()
         with written_whole(path) as temporary, bar:
-            log.setLogLevel(log.LOG_LEVEL_ERROR)  # it warns of each frame that it cannot write
-            writer = cv2.VideoWriter(str(temporary), fourcc, rate, (width, height))
-            try:
+            with writer(temporary, self.run.schedule.clock.fps, width, height) as write:
                 for frame in range(len(self.run)):
                     picture = fitted(self.draw(frame), *first.shape[:2])
-                    writer.write(np.pad(picture, fill, "edge"))
+                    write(np.pad(picture, fill, "edge"))
                     bar(frame + 1, len(self.run))
-            finally:
-                writer.release()
-                log.setLogLevel(level)
-            written = cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)
+            written = frames_in(temporary)
             if written != len(self.run):
                 raise LaeError(
-                    f"cannot write {path}: only {max(written, 0):.0f} of {len(self.run)} frames "
-                    "were written: the disk is full, or OpenCV has no codec"
+                    f"cannot write {path}: only {written} of {len(self.run)} frames were written: "
+                    "the disk is full, or OpenCV has no codec"
                 )
 
     def strip(self, frames: Sequence[int], width: int = 640) -> Image:

@@ -2,41 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lae_sim._arrays import Floats
 from lae_sim.comparison.fidelity import FidelityRow
 from lae_sim.evaluation.evaluate import Evaluation
-from lae_sim.evaluation.metrics import CENTRE_THRESHOLDS
 from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.evaluation.totals import CurveTotals
-from lae_sim.replay.run import Run
-from lae_sim.report.replay import Report
-from lae_sim.report.style import (
+from lae_sim.figures.column import ColumnFigure, column_figure
+from lae_sim.figures.lines import Curve, Line, Panel, curves_in_column, draw_curves, draw_sweep
+from lae_sim.figures.style import (
     BLUE,
     GREY,
     SKY_BLUE,
     VERMILION,
-    Style,
     forecaster_lines,
     forecaster_styles,
-    legend_below,
     new_figure,
-    panel_grid,
+    paper_styles,
     styled,
     tracker_styles,
 )
+from lae_sim.replay.run import Run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+
+Report = dict[str, Any]
+"""What a replay says of a trace (see :func:`lae_sim.report.replay.trace_report`)."""
 
 Curves = dict[str, tuple[Floats, Floats]]
 """By name: success over IoU thresholds, and precision over 0..50 px, mean over sequences."""
@@ -58,40 +58,6 @@ def mean_curves(scored: Evaluation | CurveTotals, forecasters: Iterable[str]) ->
     return {name: (mean.success, mean.precision) for name, mean in means.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A line of success and precision plots.
-
-    Attributes:
-        label: in the legend, which adds AUC and DP at 20 px.
-        success: over the IoU thresholds, float64 [N].
-        precision: over 0, 1, ..., 50 px, float64 [51].
-        style: of the line.
-    """
-
-    label: str
-    success: Floats
-    precision: Floats
-    style: Style
-
-
-@styled
-def draw_curves(curves: Sequence[Curve], title: str = "") -> Figure:
-    """Success and precision plots side by side."""
-    figure = new_figure(10, 4.2 + 0.1 * len(curves))
-    left, right = figure.subplots(1, 2)
-    figure.suptitle(title)
-    for curve in curves:
-        style = {**curve.style, "marker": ""}
-        label = f"{curve.label} [{curve.success.mean():.3f}, {curve.precision[20]:.3f}]"
-        left.plot(np.linspace(0, 1, len(curve.success)), curve.success, label=label, **style)
-        right.plot(CENTRE_THRESHOLDS, curve.precision, label=label, **style)
-    left.set(xlabel="overlap threshold", ylabel="success", xlim=(0, 1), ylim=(0, 1))
-    right.set(xlabel="centre error threshold (px)", ylabel="precision", xlim=(0, 50), ylim=(0, 1))
-    legend_below(figure)
-    return figure
-
-
 def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Figure:
     """Success and precision plots side by side, AUC and DP at 20 px in the legend.
 
@@ -99,96 +65,52 @@ def success_and_precision(named: Mapping[str, tuple[Floats, Floats]], title: str
         named: curves by name; for several traces the names are ``"trace: forecaster"``.
         title: above both plots.
     """
+    return draw_curves(_styled_curves(named), title)
+
+
+def curves_for_paper(named: Mapping[str, tuple[Floats, Floats]], of: str) -> Iterator[ColumnFigure]:
+    """The same as two figures for a paper; of many curves, those of each trace by themselves.
+
+    Args:
+        named: see :func:`success_and_precision`.
+        of: the setting, in words.
+    """
+    groups: dict[str, dict[str, tuple[Floats, Floats]]] = {}
+    for name, curves in named.items():
+        trace = name.rpartition(": ")[0] if len(named) > MOST_CURVES else ""
+        groups.setdefault(trace, {})[name] = curves
+    for trace, group in groups.items():
+        success, precision = curves_in_column(_styled_curves(group, of_paper=True))
+        end, caption = (f"-{trace}", f"{trace}: {of}") if trace else ("", of)
+        yield ColumnFigure(f"success{end}", f"Success: {caption}. In brackets: AUC.", success)
+        yield ColumnFigure(
+            f"precision{end}", f"Precision: {caption}. In brackets: precision at 20 px.", precision
+        )
+
+
+def _styled_curves(
+    named: Mapping[str, tuple[Floats, Floats]], of_paper: bool = False
+) -> list[Curve]:
+    """Curves, in which a paper has forecasters differ in their lines too."""
     parts = {name: name.rpartition(": ")[::2] for name in named}
     traces = tracker_styles(trace for trace, _ in parts.values())
     forecasters = dict.fromkeys(forecaster for _, forecaster in parts.values())
-    styles, lines = forecaster_styles(forecasters), forecaster_lines(forecasters)
-    return draw_curves(
-        [
-            Curve(
-                name,
-                *named[name],
-                {**traces[trace], "linestyle": lines[forecaster]}
-                if len(traces) > 1
-                else styles[forecaster],
-            )
-            for name, (trace, forecaster) in parts.items()
-        ],
-        title,
-    )
+    styles = paper_styles(forecasters) if of_paper else forecaster_styles(forecasters)
+    lines = forecaster_lines(forecasters)
+    return [
+        Curve(
+            name,
+            *named[name],
+            {**traces[trace], "linestyle": lines[forecaster]}
+            if len(traces) > 1
+            else styles[forecaster],
+        )
+        for name, (trace, forecaster) in parts.items()
+    ]
 
 
-@dataclass(frozen=True, eq=False)
-class Line:
-    """A line of a sweep.
-
-    Attributes:
-        label: in the legend.
-        x, y: its points, [n].
-        style: of the line; its markers are left out where there are many points.
-        band: around it, lowest and highest y, [n] each.
-    """
-
-    label: str
-    x: npt.ArrayLike
-    y: npt.ArrayLike
-    style: Style
-    band: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """A panel of a sweep.
-
-    Attributes:
-        title, xlabel, ylabel: what it shows.
-        lines: on it.
-        logarithmic: whether the horizontal axis is, to the base of 2.
-    """
-
-    title: str
-    xlabel: str
-    ylabel: str
-    lines: Sequence[Line]
-    logarithmic: bool = False
-
-
-@styled
-def draw_sweep(
-    panels: Sequence[Panel], columns: int, title: str = "", names: Sequence[str] = (), **shared: Any
-) -> Figure:
-    """Lines over what was varied, a legend for all panels below them.
-
-    Args:
-        panels: row by row.
-        columns: panels in a row.
-        title: above all.
-        names: labels in the order of the legend; by default in that of the lines.
-        shared: which axes panels share, as for Matplotlib's ``subplots``.
-    """
-    figure, grid = panel_grid(len(panels), columns, 10 / min(columns, 3), 3, **shared)
-    figure.suptitle(title)
-    for place, (axes, panel) in enumerate(zip(grid, panels)):
-        for line in panel.lines:
-            style = {**line.style, "marker": ""} if np.size(line.x) > MOST_MARKERS else line.style
-            axes.plot(line.x, line.y, label=line.label, **style)
-            if line.band is not None:
-                colour = line.style["color"]
-                axes.fill_between(line.x, *line.band, color=colour, alpha=0.12, linewidth=0)
-        axes.set(title=panel.title, ylabel=panel.ylabel)
-        if not shared.get("sharex") or place + columns >= len(panels):
-            axes.set_xlabel(panel.xlabel)
-        if panel.logarithmic:
-            axes.set_xscale("log", base=2)
-        xs = np.unique(np.concatenate([np.ravel(line.x) for line in panel.lines]))
-        if len(xs) <= MOST_TICKS:
-            axes.set_xticks(xs, [f"{x:g}" for x in xs], minor=False)
-    legend_below(figure, names)
-    return figure
-
-
-MOST_MARKERS, MOST_TICKS = 12, 8
-"""More points have no markers, and not each a tick."""
+MOST_CURVES = 8
+"""More curves are not drawn in one figure of a paper."""
 
 _AXES = {"fps": "world frame rate (fps)", "latency_scale": "scale of the processing times"}
 _SCORES = {"auc": "AUC", "dp20": "DP at 20 px"}
@@ -211,6 +133,21 @@ def sweep_figure(
             is a row of panels for each trace and value of the other.
         title: above all.
     """
+    panels = sweep_panels(reports, labels, sigma, swept)
+    return draw_sweep(panels, 2, title, sharex=True, sharey="col")
+
+
+def sweep_panels(
+    reports: Sequence[Report],
+    labels: Sequence[str],
+    sigma: float,
+    swept: Sequence[str],
+    of_paper: bool = False,
+) -> list[Panel]:
+    """AUC and DP of each forecaster over what was swept, by turns (see :func:`sweep_figure`).
+
+    ``of_paper`` has forecasters differ in their lines too.
+    """
     x, *others = swept
     rows: dict[str, list[Report]] = {}
     for label, report in zip(labels, reports):
@@ -229,14 +166,33 @@ def sweep_figure(
                         scores.setdefault(result["forecaster"], []).append(result[metric])
             if members[0]["offline"] is not None:
                 scores["offline"] = [members[0]["offline"][metric]] * len(places)
-            styles = forecaster_styles(scores)
+            styles = paper_styles(scores) if of_paper else forecaster_styles(scores)
             lines = [
                 Line(forecaster, places, np.array(values, np.float64), styles[forecaster])
                 for forecaster, values in scores.items()
             ]
             logarithmic = x == "latency_scale" and places[0] > 0
             panels.append(Panel(row_name, _AXES[x], name, lines, logarithmic))
-    return draw_sweep(panels, 2, title, sharex=True, sharey="col")
+    return panels
+
+
+def sigma_panels(report: Report) -> list[Panel]:
+    """AUC and DP of each forecaster over the permitted latency, in one world."""
+    panels = []
+    for metric, name in _SCORES.items():
+        points: dict[str, list[tuple[float, float | None]]] = {}
+        for result in report["results"]:
+            points.setdefault(result["forecaster"], []).append((result["sigma"], result[metric]))
+        if report["offline"] is not None:
+            on = next(iter(points.values()))
+            points["offline"] = [(sigma, report["offline"][metric]) for sigma, _ in on]
+        styles = paper_styles(points)
+        lines = []
+        for forecaster, pairs in points.items():
+            sigmas, scores = np.array(sorted(pairs), np.float64).T
+            lines.append(Line(forecaster, sigmas, scores, styles[forecaster]))
+        panels.append(Panel("", "permitted latency σ (frames)", name, lines))  # noqa: RUF001
+    return panels
 
 
 @styled
@@ -256,49 +212,80 @@ def timeline_figure(
         count: number of world frames shown.
         pairing: of the run at that sigma, where it is known already.
     """
+    figure = new_figure(12, 3.6)
+    axes = figure.subplots()
+    end = min(first + count, run.schedule.length)
+    _draw_timeline(axes, run, sigma, range(first, end), pairing)
+    axes.set_title(f"{run.recording.name}: who answers what")
+    return figure
+
+
+def timeline_for_paper(run: Run, sigma: Fraction = Fraction(0)) -> ColumnFigure:
+    """The first calls of a run after its initialisation, as a figure for a paper."""
+    schedule = run.schedule
+    frames = schedule.frames.tolist()
+    first = max(frames[min(1, len(frames) - 1)] - 2, 0)
+    few = frames[min(4, len(frames) - 1)] - first
+    shown = range(first, min(first + min(max(few, 8), 16), schedule.length))
+    draw = partial(_draw_timeline, run=run, sigma=sigma, shown=shown, size=6)
+    name = run.recording.name
+    return ColumnFigure(
+        f"timeline-{name}",
+        f"{name}: frames as they arrive (hollow: skipped), the tracker at work on them, and the "
+        "frame whose output answers the query for each",
+        column_figure(draw, 1.5),
+    )
+
+
+def _draw_timeline(
+    axes: Axes,
+    run: Run,
+    sigma: Fraction,
+    shown: range,
+    pairing: Pairing | None = None,
+    size: float = 7,
+) -> None:
+    """Frames, calls and queries, one above the other; letters of a size in points."""
     schedule = run.schedule
     clock = schedule.clock
     frame_ms = clock.milliseconds(1)
-    end = min(first + count, schedule.length)
-    figure = new_figure(12, 3.6)
-    axes = figure.subplots()
     processed = set(schedule.frames.tolist())
-    for frame in range(first, end):
+    for frame in shown:
         taken = frame in processed
         colour = BLUE if taken else VERMILION
         arrival_ms = clock.arrival_ms(frame)
         axes.plot(arrival_ms, 2, "o", color=colour, fillstyle="full" if taken else "none")
-        axes.annotate(str(frame), (arrival_ms, 2.18), ha="center", fontsize=7)
+        axes.annotate(str(frame), (arrival_ms, 2.18), ha="center", fontsize=size)
     ticks_per_ms = clock.ticks_per_ns * 1e6
-    left, right = clock.arrival_ms(first) - frame_ms / 2, clock.arrival_ms(end) + frame_ms / 2
+    left = clock.arrival_ms(shown.start) - frame_ms / 2
+    right = clock.arrival_ms(shown.stop) + frame_ms / 2
     for frame, start, ready in zip(schedule.frames, schedule.start, schedule.ready):
-        if ready >= clock.arrival(first) and frame < end:
+        if ready >= clock.arrival(shown.start) and frame < shown.stop:
             begin, length = start / ticks_per_ms, (ready - start) / ticks_per_ms
             axes.barh(1, length, left=begin, height=0.42, color=BLUE, edgecolor="white")
-            if begin + length / 2 < right:
-                axes.text(begin + length / 2, 1, str(frame), ha="center", va="center", color="w")
+            middle = (max(begin, left) + min(begin + length, right)) / 2
+            axes.text(middle, 1, str(frame), ha="center", va="center", color="w", fontsize=size + 1)
     known = pairing or pair([schedule], [sigma])
-    _draw_queries(axes, run, sigma, known, first, end)
+    _draw_queries(axes, run, sigma, known, shown, size)
     axes.set_yticks(
         [2, 1, 0], ["world frame\n(hollow: skipped)", "tracker busy", "query and source"]
     )
-    axes.set(ylim=(-0.6, 2.5), xlabel="time (ms)", title=f"{run.recording.name}: who answers what")
+    axes.set(ylim=(-0.6, 2.5), xlabel="time (ms)")
     axes.set_xlim(left, right)
-    return figure
 
 
 def _draw_queries(
-    axes: Axes, run: Run, sigma: Fraction, pairing: Pairing, first: int, end: int
+    axes: Axes, run: Run, sigma: Fraction, pairing: Pairing, shown: range, size: float
 ) -> None:
     """A mark for each query, joined to the moment when the output that answers it was ready."""
     schedule = run.schedule
     clock = schedule.clock
     spans = zip(schedule.frames, schedule.ready, pairing.first[:, 0], pairing.end[:, 0])
     for source, ready, begin, stop in spans:
-        for frame in range(max(begin, first), min(stop, end)):
+        for frame in range(max(begin, shown.start), min(stop, shown.stop)):
             query = clock.arrival_ms(frame, sigma)
             axes.plot(query, 0, "|", color="black", markersize=12)
-            axes.annotate(f"{source}", (query, -0.4), ha="center", fontsize=7)
+            axes.annotate(f"{source}", (query, -0.4), ha="center", fontsize=size)
             if source:
                 axes.plot(
                     [ready / clock.ticks_per_ns / 1e6, query], [0.78, 0.12], lw=0.6, color="grey"

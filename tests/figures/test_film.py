@@ -10,7 +10,7 @@ pytest.importorskip("cv2", reason="drawing needs OpenCV")
 import cv2
 
 from lae_sim.errors import LaeError
-from lae_sim.report.film import WHITE, colours_of, draw_frame, film_strip
+from lae_sim.figures.film import WHITE, colours_of, draw_frame, film_strip
 
 NONE = [np.nan] * 4
 

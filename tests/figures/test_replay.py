@@ -9,8 +9,8 @@ import lae_sim
 from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.evaluation.pairing import pair
 from lae_sim.evaluation.totals import CurveTotals
-from lae_sim.report import figures as plots
-from lae_sim.report.style import save
+from lae_sim.figures import replay as plots
+from lae_sim.figures.style import save
 
 FORECASTERS = {"hold": lae_sim.Hold, "kalman": lae_sim.Kalman}
 

@@ -10,7 +10,7 @@ import pytest
 from tidy_scores import random_scores, tidy
 
 from lae_sim.comparison.statistics import by_attribute, summarise
-from lae_sim.report.forecaster_figures import against, attribute_bars, overview
+from lae_sim.figures.forecasters import against, attribute_bars, overview
 
 
 def table(traces=1, latencies=("recorded",), scales=(1.0,), sigmas=(0.0,)):

@@ -1,0 +1,21 @@
+"""What figures and tables call metrics and settings."""
+
+from __future__ import annotations
+
+METRIC_LABELS = {
+    "auc": "AUC",
+    "dp20": "DP@20",
+    "norm_dp20": "norm. P",
+    "norm_auc": "norm. AUC",
+    "mauc": "mAUC",
+    "mdp20": "mDP@20",
+    "modelled_auc": "modelled AUC",
+    "modelled_dp20": "modelled DP@20",
+    "modelled_mauc": "modelled mAUC",
+    "modelled_mdp20": "modelled mDP@20",
+}
+
+
+def setting_label(latency: str, scale: float) -> str:
+    """A latency and its scale, such as ``"recorded x 2"``."""
+    return latency if scale == 1 else f"{latency} x {scale:g}"

@@ -1,0 +1,31 @@
+"""``benchmarks/publish.py`` writes what benchmarks printed onto the page about speed."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+from places import REPOSITORY
+
+SPEC = importlib.util.spec_from_file_location("publish", REPOSITORY / "benchmarks" / "publish.py")
+assert SPEC is not None
+assert SPEC.loader is not None
+publish = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(publish)
+
+
+def test_the_page_has_a_place_for_each(tmp_path: Path) -> None:
+    for name in publish.NAMES:
+        (tmp_path / f"{name}.txt").write_text(f"what {name} \\1 printed\n")
+    page = publish.published(publish.PAGE.read_text(encoding="utf-8"), tmp_path)
+    for name in publish.NAMES:
+        mark = f"<!-- made by benchmarks/{name}.py -->"
+        assert f"{mark}\n```text\nwhat {name} \\1 printed\n```\n" in page
+    assert f"lae_sim {publish.__version__}, Python 3." in page
+    assert page.count("## ") == 3
+
+
+def test_a_page_without_a_place_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="0 places"):
+        publish.replaced("# Speed\n", "(a).*(b)", "text")
