@@ -36,7 +36,7 @@ _AT_ONCE = 1 << 16  # counts
 _NOISE_DECIMALS = 12  # equal differences of scores in 0..1 are equal to this many decimals
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Interval:
     """The ends of an interval."""
 
@@ -48,7 +48,7 @@ class Interval:
         return {f"{name}_low": self.low, f"{name}_high": self.high}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Difference:
     """A mean paired difference of scores over sequences.
 
@@ -66,7 +66,7 @@ class Difference:
     worse: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Recovered:
     """The share of the latency loss that a forecaster wins back.
 

@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -412,8 +412,26 @@ def _write(results: StudyResults) -> None:
             write_csv(records, path)
         else:
             path.unlink(missing_ok=True)
-    with written_whole(results.folder / "study.json") as temporary:
-        temporary.write_text(json.dumps(results.document(), allow_nan=False), "utf-8")
+    with (
+        written_whole(results.folder / "study.json") as temporary,
+        open(temporary, "w", encoding="utf-8") as file,
+    ):
+        file.writelines(_json(results.document()))
+
+
+def _json(document: Mapping[str, Any]) -> Iterator[str]:
+    """The text of a document, a line of its lists at a time: as a whole it may be large."""
+    yield "{"
+    for place, (key, value) in enumerate(document.items()):
+        yield f"{', ' * bool(place)}{json.dumps(key)}: "
+        if isinstance(value, (list, tuple)):
+            yield "["
+            for i, each in enumerate(value):
+                yield f"{', ' * bool(i)}{json.dumps(each, allow_nan=False)}"
+            yield "]"
+        else:
+            yield json.dumps(value, allow_nan=False)
+    yield "}"
 
 
 def write_csv(records: Sequence[Record], path: Path) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from sys import intern
 from typing import Any
 
 import numpy as np
@@ -153,7 +154,7 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
         entries = rows.num_rows // count
         sequences = rows.column("sequence").chunk(0)  # its take would import pyarrow.compute
         of_entry = [sequences[row].as_py() for row in range(0, rows.num_rows, count)]
-        names = tuple(sorted(set(of_entry)))
+        names = tuple(map(intern, sorted(set(of_entry))))
         place = {name: s for s, name in enumerate(names)}
         order = np.lexsort((  # by repetition, then by sequence
             np.array([place[name] for name in of_entry]), column("repetition")[::count],
