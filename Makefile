@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint docs pages bench samples clean
+.PHONY: demo test lint docs pages bench samples notebooks dist clean
 
 demo: $(VENV)/.demo  ## replay the sample traces
 	$(BIN)/lae-sim replay traces/synthetic-slow.parquet traces/synthetic-fast.parquet
@@ -31,6 +31,14 @@ bench: $(VENV)/.test  ## measure speed and memory
 samples: $(VENV)/.demo  ## make the sample traces anew
 	$(BIN)/python traces/make_samples.py
 	$(BIN)/python traces/make_cases.py
+
+notebooks: $(VENV)/.test  ## run the notebooks, and store them with what they print and draw
+	$(BIN)/python tests/stored_notebooks.py
+
+dist: $(VENV)/.dev  ## build wheel and sdist in dist/, and check them as the index would
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/twine check --strict dist/*
 
 clean:
 	rm -rf $(VENV)

@@ -110,6 +110,11 @@ def abridged(text: str, most: int = _SCREEN) -> str:
     return f"{text[: most - end - 5]} ... {text[-end:]}"
 
 
+def install(extra: str) -> str:
+    """The command that installs what an extra of this package needs, to end a message with."""
+    return f"pip install 'lae-sim[{extra}]'"
+
+
 def listed(names: Iterable[object], most: int = 5) -> str:
     """Names, each of at most 60 characters: some of them, and how many more there are."""
     texts = [abridged(str(name), 60) for name in names]

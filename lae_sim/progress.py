@@ -6,13 +6,14 @@ what stands on the screen, or fail for want of a letter.
 
 from __future__ import annotations
 
+import shutil
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, TypeAlias
 
-from lae_sim.errors import LaeError, abridged, visible
+from lae_sim.errors import LaeError, abridged, shown, visible
 
 SOON_S = 0.5
 """What is done sooner shows no bar, unless it is asked for."""
@@ -50,6 +51,13 @@ def print_text(text: str, end: str = "\n") -> None:
         print(shown, end=end)
 
 
+def screen_width() -> int | None:
+    """How many letters a line of the terminal holds that shows the standard output; else None."""
+    if sys.stdout is None or not sys.stdout.isatty():
+        return None
+    return shutil.get_terminal_size().columns
+
+
 @contextmanager
 def printing() -> Iterator[None]:
     """Say what is amiss where the standard output takes no more.
@@ -65,6 +73,12 @@ def printing() -> Iterator[None]:
         raise OutputError(f"the standard output: {error.strerror or error}") from error
 
 
+ShowProgress: TypeAlias = bool | Callable[[int, int | None, str], object] | None
+"""Whether to show a progress bar, by default where somebody looks, on a terminal or in a notebook;
+or what is called instead, ``progress(done, total, what)``: how much is done of how much, None where
+that is not known, and what is going on, perhaps empty."""
+
+
 class ProgressBar:
     """A bar on the standard error stream; ``bar(done, total)`` moves it.
 
@@ -73,20 +87,28 @@ class ProgressBar:
     Args:
         title: what stands before it.
         unit: what is counted, in the plural.
-        show: whether to show it; by default where somebody looks, on a terminal or in a notebook.
+        show: whether to show it, or what is called instead (see :data:`ShowProgress`).
 
     Attributes:
         shown: whether it is shown.
+
+    Raises:
+        LaeError: if ``show`` is neither.
     """
 
-    def __init__(self, title: str, unit: str, show: bool | None = None) -> None:
+    def __init__(self, title: str, unit: str, show: ShowProgress = None) -> None:
+        if not (show is None or isinstance(show, bool) or callable(show)):
+            raise LaeError(f"progress: {shown(show)} is neither true, false nor a function")
         self._title, self._unit = abridged(visible(title), 60), unit
-        self.shown = _somebody_looks() if show is None else show
+        self._report = show if callable(show) else None
+        self.shown = _somebody_looks() if show is None else show is True
         self._delay = 0.0 if show else SOON_S
         self._bar: Any = None
 
     def __call__(self, done: int, total: int | None, what: str = "") -> None:
         """Show that ``done`` of ``total`` are done, and perhaps what is going on."""
+        if self._report is not None:
+            self._report(done, total, what)
         if not self.shown:
             return
         if self._bar is None:

@@ -60,6 +60,7 @@ ANSWERS: dict[str, Any] = {
     "no number": (10, 20, 30, NoNumber()),
     "own text": Text("1234"),
     "own float": (10, 20, 30, NoFloat(40)),
+    "found": (True, BOX),
     "three": (10, 20, 30),
     "five": (10, 20, 30, 40, 50),
     "matrix": np.array([BOX]),

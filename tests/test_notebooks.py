@@ -1,13 +1,12 @@
-"""Every notebook runs from top to bottom, and draws its pictures."""
+"""Every notebook runs from top to bottom, draws its pictures, and is stored with what it prints."""
 
 import os
 
 import nbformat
 import pytest
-from nbclient import NotebookClient
 from places import REPOSITORY
+from stored_notebooks import NOTEBOOKS, code_cells, executed, is_measured, kinds, said
 
-NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 PICTURES = {
     "01_replay_a_trace": 4,
     "02_profile_your_device": 4,
@@ -21,9 +20,15 @@ IMAGES = {"image/png", "image/svg+xml"}
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 @pytest.mark.filterwarnings("ignore:Proactor event loop:RuntimeWarning")
-def test_notebook_runs(path, monkeypatch):
+def test_notebook_runs_and_is_stored_with_what_it_prints(path, monkeypatch):
     monkeypatch.delenv("LAE_SIM_DATA", raising=False)
-    assert len(pictures_of(path, monkeypatch)) == PICTURES[path.stem]
+    fresh = run(path, monkeypatch)
+    assert len(pictures_of(fresh)) == PICTURES[path.stem]
+    stored = nbformat.read(path, as_version=4)
+    for old, new in zip(code_cells(stored), code_cells(fresh)):
+        assert kinds(old) == kinds(new), f"run `make notebooks`: {new.source}"
+        if not is_measured(path, new):
+            assert [*map(said, old.outputs)] == [*map(said, new.outputs)], "run `make notebooks`"
 
 
 @pytest.mark.filterwarnings("ignore:Proactor event loop:RuntimeWarning")
@@ -33,25 +38,32 @@ def test_the_papers_tables_with_boxes_of_one_dataset(shared_data, tmp_path, monk
         (tmp_path / part).symlink_to(shared_data / part)
     monkeypatch.setenv("LAE_SIM_DATA", str(tmp_path))
     path = REPOSITORY / "notebooks" / "05_the_papers_tables.ipynb"
-    assert len(pictures_of(path, monkeypatch)) == 2
+    assert len(pictures_of(run(path, monkeypatch))) == 2
 
 
-def pictures_of(path, monkeypatch):
-    """The pictures that a notebook draws; it must not complain."""
+def run(path, monkeypatch):
+    """A notebook with what a run of it left; it must not complain."""
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])
     )
-    notebook = nbformat.read(path, as_version=4)
-    resources = {"metadata": {"path": str(path.parent)}}
     monkeypatch.setenv("TQDM_DISABLE", "1")  # a progress bar is no complaint
-    NotebookClient(notebook, timeout=120, resources=resources).execute()
-    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
-    pictures = [output for output in outputs if IMAGES & {*output.get("data", {})}]
+    notebook = executed(path)
+    outputs = [output for cell in code_cells(notebook) for output in cell.outputs]
     assert not [output for output in outputs if output.get("name") == "stderr"]
-    return pictures
+    return notebook
+
+
+def pictures_of(notebook):
+    """The pictures that it drew."""
+    outputs = [output for cell in code_cells(notebook) for output in cell.outputs]
+    return [output for output in outputs if IMAGES & {*output.get("data", {})}]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_is_stored_without_outputs(path):
-    notebook = nbformat.read(path, as_version=4)
-    assert not any(cell.get("outputs") for cell in notebook.cells)
+def test_notebook_is_stored_without_what_differs_between_runs(path):
+    assert path.stat().st_size < 300_000
+    for cell in code_cells(nbformat.read(path, as_version=4)):
+        assert cell.execution_count is None
+        assert not {"execution", "ExecuteTime"} & {*cell.metadata}
+        assert not [each for each in cell.outputs if each.get("execution_count") is not None]
+        assert str(REPOSITORY) not in str(cell.outputs)

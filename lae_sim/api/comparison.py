@@ -27,7 +27,7 @@ from lae_sim.evaluation.metrics import find_convention
 from lae_sim.evaluation.modelled import Ranking
 from lae_sim.files import sequence_names
 from lae_sim.learning.registry import COMPARED, load_any, load_forecaster
-from lae_sim.progress import ProgressBar
+from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, label_of, named, open_others
 
@@ -260,7 +260,7 @@ def compare_forecasters(
     camera_lag: int | None = None,
     folds: int = 5,
     seed: int = 0,
-    progress: bool | None = None,
+    progress: ShowProgress = None,
     forget_arrivals: bool = False,
 ) -> ComparisonResult:
     """Which forecaster helps, by how much, and how sure that is.
@@ -284,7 +284,8 @@ def compare_forecasters(
             :func:`lae_sim.learning.registry.find_camera`).
         folds: in how many parts the sequences are dealt out, if anything is trained.
         seed: of folds, training and bootstrap.
-        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        progress: whether to show a progress bar, by default on a terminal and in a notebook; or a
+            function, which is told: ``progress(done, total, what)``.
 
     Raises:
         LaeError: if an argument is impossible, a file is missing, or a frame is asked for that a

@@ -30,14 +30,14 @@ from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError, hint, listed, shown
 from lae_sim.evaluation.caveats import SkippedStalls, notes_on
 from lae_sim.evaluation.evaluate import Evaluation, Observer, answers, evaluate_groups
-from lae_sim.evaluation.metrics import METRICS, find_convention
+from lae_sim.evaluation.metrics import METRICS, UNSCORED, find_convention
 from lae_sim.evaluation.modelled import FIGURES
 from lae_sim.evaluation.totals import Totals, search_report
 from lae_sim.files import sequence_names
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.learning.registry import load_forecaster
-from lae_sim.progress import ProgressBar
+from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.latency import LatencySource
 from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import Run, Runs
@@ -580,9 +580,14 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
         parts: of one or several traces, in one world or several.
         sigma: the permitted latency of a sweep's scores; the first by default. Success and
             precision are at the first in any case.
+
+    Raises:
+        LaeError: if no sequence is scored.
     """
     from lae_sim.figures.replay import success_and_precision, sweep_figure
 
+    if not any(part.totals.replay.scored.any() for part in parts):
+        raise LaeError(f"nothing to draw: {UNSCORED}")
     plotted = _Plotted.of(parts, sigma)
     if plotted.swept:
         reports = [part.document() for part in parts]
@@ -658,7 +663,7 @@ def evaluate(
     root: str | os.PathLike[str] | None = None,
     dataset: str | None = None,
     camera_lag: int | None = None,
-    progress: bool | None = None,
+    progress: ShowProgress = None,
     forget_arrivals: bool = False,
 ) -> EvaluationResult:
     """Replay traces and score them, latency counted.
@@ -690,7 +695,8 @@ def evaluate(
         sequences: those wanted; all by default.
         root, dataset, camera_lag: the frames, for ``camera+NAME`` (see
             :func:`lae_sim.learning.registry.find_camera`).
-        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        progress: whether to show a progress bar, by default on a terminal and in a notebook; or a
+            function, which is told: ``progress(done, total, what)``.
         forget_arrivals: let frames arrive evenly also where a trace says when each of them did,
             which is needed for another rate.
 
@@ -740,7 +746,7 @@ def evaluate(
 
 @contextmanager
 def scenario_bar(
-    asked: Sequence[Scenario], show: bool | None = None
+    asked: Sequence[Scenario], show: ShowProgress = None
 ) -> Iterator[Callable[[int], object]]:
     """A progress bar over the world frames of scenarios, and what moves it by so many frames."""
     known = [scenario.trace.frames for scenario in asked]

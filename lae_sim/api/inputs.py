@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown, visible
 from lae_sim.files import sequence_names
-from lae_sim.forecast.base import Hold
+from lae_sim.forecast.base import Hold, own_factory
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import find_camera
 from lae_sim.replay.world import TraceLike, named, open_trace, several
@@ -122,18 +122,13 @@ def _maker(name: Any, forecaster: Any) -> Any:
     """A name, or what makes forecasters; of a class of trainers, a trainer."""
     if not isinstance(name, str):
         raise LaeError(f"forecasters: the name of a forecaster is text, not {shown(name)}")
-    if isinstance(forecaster, type) and hasattr(forecaster, "fit"):
-        return forecaster()
-    makes = (
-        callable(forecaster) or hasattr(forecaster, "fit") or hasattr(forecaster, "for_sequence")
-    )
-    if not (makes or isinstance(forecaster, str)):
+    if hasattr(forecaster, "fit"):
+        return forecaster() if isinstance(forecaster, type) else forecaster
+    if isinstance(forecaster, str):
+        return forecaster
+    if not (callable(forecaster) or hasattr(forecaster, "for_sequence")):
         raise LaeError(f"forecasters: {shown(forecaster)} is neither a name nor makes forecasters")
-    if isinstance(forecaster, type) and not hasattr(forecaster, "for_sequence"):
-        missing = [each for each in ("update", "predict") if not hasattr(forecaster, each)]
-        if missing:
-            raise LaeError(f"forecasters: the class {name} has no {' and no '.join(missing)}")
-    return forecaster
+    return own_factory("forecasters", forecaster)
 
 
 def cost_texts(costs: Costs) -> tuple[str, ...]:

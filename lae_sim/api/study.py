@@ -13,7 +13,8 @@ from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
 from lae_sim.figures.study import study_in_columns
 from lae_sim.files import text_digest
-from lae_sim.progress import ProgressBar
+from lae_sim.plugins import looking_in
+from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
 from lae_sim.report.paper import Paper, remove_paper, write_paper, written_before
@@ -35,7 +36,7 @@ def run_study(
     workers: int | None = None,
     scheduler: str | None = None,
     report: bool = True,
-    progress: bool | None = None,
+    progress: ShowProgress = None,
     **keys: Any,
 ) -> StudyResults:
     """Replay and score many traces in many worlds, or go on where an earlier run stopped.
@@ -48,7 +49,8 @@ def run_study(
         workers: processes on this machine; by default one for each core. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead.
         report: whether to write ``report.html``, ``figures/`` and ``tables/`` too.
-        progress: whether to show a progress bar; by default on a terminal and in a notebook.
+        progress: whether to show a progress bar, by default on a terminal and in a notebook; or a
+            function, which is told: ``progress(done, total, what)``.
         keys: keys of the study file (see :class:`Study`).
 
     In a script, call it under ``if __name__ == "__main__":``, since workers import the script.
@@ -74,7 +76,7 @@ def run_study(
         if scheduler is not None:
             raise LaeError("workers: for this machine: a scheduler says where to compute instead")
     made, base, kept = _asked_for(study, keys, folder)
-    with ProgressBar("study", "tasks", progress) as bar:
+    with ProgressBar("study", "tasks", progress) as bar, looking_in(base or "."):
 
         def advance(what: str, done: int, total: int) -> None:
             bar(done, total, what)
@@ -97,7 +99,8 @@ def _asked_for(
         return Study.of(keys if study is None else study), None, kept
     if not isinstance(study, (str, os.PathLike)) or str(study).endswith(".parquet"):
         raise LaeError(
-            f"study: {shown(study)} is no TOML file and no Study; name traces by traces=..."
+            f"study: {shown(study)} is no TOML file and no Study; name traces by traces=... (in a "
+            'TOML file: traces = ["a.parquet", "b.parquet"])'
         )
     path = Path(study)
     kept = folder or f"{path.stem}-results"

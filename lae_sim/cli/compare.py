@@ -22,7 +22,7 @@ from lae_sim.cli.options import (
 )
 from lae_sim.engine.clock import parse_rational, whole
 from lae_sim.learning.registry import COMPARED, FORECASTERS
-from lae_sim.progress import print_text
+from lae_sim.progress import print_text, screen_width
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -79,7 +79,7 @@ def parser() -> argparse.ArgumentParser:
         help="permitted latencies (default: 0)",
     )
     sigma.add_argument("--sigma-grid", action="store_true", help="sigma = 0, 0.02, ..., 1")
-    add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
+    add("--convention", default="pysot", help="how frames count: as in replay (default: pysot)")
     add("--attributes", action="store_true", help="compare each attribute of the dataset too")
     add("--folds", type=argument(whole), default=5, help="of the training (default: 5)")
     add("--seed", type=argument(whole), default=0, help="of training and bootstrap (default: 0)")
@@ -168,7 +168,7 @@ def _compare(arguments: argparse.Namespace) -> None:
         print_json(document)
         return
     for table in reversed(tables.values()):
-        print_text(comparison_table(table), end="\n\n")
+        print_text(comparison_table(table, screen_width()), end="\n\n")
     about = f"convention {arguments.convention}, policy {arguments.policy}"
     print_text("\n".join([about, *result.notes]))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser, print_json
-from lae_sim.errors import LaeError, listed
+from lae_sim.errors import LaeError, install, listed
 from lae_sim.files import check_distinct, check_places
 from lae_sim.progress import ProgressBar, print_text
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary
 
 _FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "json", "npz", "lae-pvt")
-_EXAMPLES = """\
+_EXAMPLES = f"""\
 formats (auto tells them apart):
   got10k       <seq>.txt with <seq>_time.txt or times/<seq>_time.txt (s);
                <seq>/<seq>_001.txt with <seq>/<seq>_time.txt
@@ -29,7 +29,8 @@ formats (auto tells them apart):
   npz          one file, an array [frames, 4] per sequence: needs --time
   lae-pvt      <seq>.pkl of LAE-PVT and PVT++, recorded in real time
 Names may be <dataset>_<seq> (nfs_, uav_, ...), <seq>_<tracker> and <tracker>_<seq> in any format;
-of several trackers in a folder --tracker chooses one. A .mat of version 7.3 needs lae-sim[mat73].
+of several trackers in a folder --tracker chooses one. A .mat of version 7.3 needs h5py
+({install("mat73")}).
 
 examples:
   lae-sim convert results/kcf --truth OTB100 --out kcf.parquet
@@ -62,8 +63,8 @@ def parser() -> argparse.ArgumentParser:
         "--time",
         default="measured",
         help="measured (default), constant:47ms, mean-fps:120, or mean-fps:FILE.csv with columns "
-        "sequence, fps and perhaps tracker, frames; ,init=800ms at the end of one that is not "
-        "measured says what the initialisation takes (default: as a frame)",
+        "sequence, fps and perhaps tracker, frames, or tracker, fps; ,init=800ms at the end of one "
+        "that is not measured says what the initialisation takes (default: as a frame)",
     )
     add(
         "--time-unit",

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from lae_sim.cli.options import add_search, check_outputs, exit_status, new_parser, print_json
-from lae_sim.progress import print_text
+from lae_sim.progress import print_text, screen_width
 
 PROGRAM = "lae-sim fidelity"
 
@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
     add("--closed-loop", **several, required=True, help="real-time traces")
     add("--strided", **several, help="passes on every N-th frame, and gap passes")
     add("--forecaster", nargs="+", default=["hold"], metavar="NAME", help="default: hold")
-    add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
+    add("--convention", default="pysot", help="how frames count: as in replay (default: pysot)")
     add_search(made, pre_forecaster=False)
     add("--per-sequence", action="store_true", help="report each sequence")
     add("--json", action="store_true", help="print one JSON object instead of tables")
@@ -101,13 +101,14 @@ def _fidelity(arguments: argparse.Namespace) -> None:
         document = {**head, **settings, "traces": arguments.traces, **parts, "verdicts": verdicts}
         print_json(document)
         return
+    width = screen_width()
     if arguments.per_sequence:
-        print_text(fidelity_table(rows), end="\n\n")
-    print_text(fidelity_table(summary), end="\n\n")
+        print_text(fidelity_table(rows, width), end="\n\n")
+    print_text(fidelity_table(summary, width), end="\n\n")
     if len({each.closed_loop for each in summary}) > 1:
-        print_text(fidelity_table(overall), end="\n\n")
+        print_text(fidelity_table(overall, width), end="\n\n")
     if spreads:
-        print_text(spread_table(spreads), end="\n\n")
+        print_text(spread_table(spreads, width), end="\n\n")
     print_text(
         f"AUC by convention {arguments.convention}; |d| is |replay - closed loop| of a sequence.\n"
         "every-frame: boxes of TRACE; strided: of the pass nearest to the frames skipped;\n"

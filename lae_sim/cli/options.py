@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import select
 import signal
 import sys
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
 from lae_sim.decoding import MAX_DECODED, max_decoded, parse_size
 from lae_sim.engine.clock import parse_fps, parse_rational, whole
-from lae_sim.errors import LaeError, abridged, visible
+from lae_sim.errors import LaeError, abridged, hint, visible
 from lae_sim.progress import OutputError, print_text, printing, tell
 
 if TYPE_CHECKING:
@@ -206,6 +207,8 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose errors are as short as those of the work."""
 
     def error(self, message: str) -> NoReturn:
+        if unknown := re.match(r"unrecognized arguments: (--[^\s=]+)", message):
+            message += hint(unknown[1], self._option_string_actions)
         tell(f"{self.prog}: error: {abridged(visible(message))} ({self.prog} --help says more)")
         self.exit(2)
 

@@ -21,7 +21,7 @@ from lae_sim.cli.options import (
 from lae_sim.engine.clock import parse_budget, parse_duration, parse_fps, parse_stride, whole
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.plugins import key_and_value
-from lae_sim.progress import ProgressBar, print_text, tell
+from lae_sim.progress import ProgressBar, print_text, screen_width, tell
 
 if TYPE_CHECKING:
     from lae_sim.profile.passes import PassSummary
@@ -255,7 +255,7 @@ def _print_summary(traces: Sequence[PassSummary]) -> None:
 
     from lae_sim.report.trace import profile_table
 
-    print_text(profile_table(traces))
+    print_text(profile_table(traces, screen_width()))
     first, *others = traces
     kind = first.schedule["kind"]
     strided = [each for each in others if "stride" in each.schedule]

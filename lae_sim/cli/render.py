@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import add_world, check_outputs, exit_status, new_parser, worlds_of
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, install
 from lae_sim.figures.film import Scene, writes_h264
 from lae_sim.files import file_names
 from lae_sim.learning.registry import load_forecaster
@@ -100,7 +100,7 @@ def _render(arguments: argparse.Namespace) -> None:
     if (folder or kind == ".mp4") and not writes_h264():
         tell(
             f"{PROGRAM}: films are MPEG-4 Part 2 here, which browsers do not play: "
-            "pip install 'lae-sim[film]' makes them H.264"
+            f"{install('film')} makes them H.264"
         )
     for run, film in zip(runs, films):
         scene = Scene.of(run, sequences[run.recording.name], metadata, forecasters)

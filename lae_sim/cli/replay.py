@@ -25,7 +25,7 @@ from lae_sim.engine.clock import parse_rational
 from lae_sim.errors import LaeError
 from lae_sim.files import labels
 from lae_sim.learning.registry import FORECASTERS
-from lae_sim.progress import print_text
+from lae_sim.progress import print_text, screen_width
 
 if TYPE_CHECKING:
     from lae_sim.api.evaluation import Scenario
@@ -50,13 +50,29 @@ examples:
   lae-sim replay trace.parquet --forecaster my_package.my_module:MyForecaster --per-sequence
 
 {FORECASTERS}
-policies:     latest, fifo, every:N, shrinking-tail:TIME (expected processing time, such as 47ms),
-              vot-realtime[:GRACE] (the VOT toolkit's rule: it skips frames, never scores latency)
-              or your own, package.module:object
-latencies:    recorded, by-call, constant:TIME, resample:SEED, lognormal:SEED,
-              bootstrap:SEED[:BLOCK], or your own, package.module:object; each may end in
-              ,init=TIME, what the initialisation takes: constant:47ms,init=800ms
-conventions:  pysot, elae, otb, lasot, got10k, got10k-101, exclude
+policies, by which a free tracker takes a frame:
+  latest                  the newest that has arrived, or the next to arrive
+  fifo                    every frame in order; they queue
+  every:N                 every N-th frame in order
+  shrinking-tail:TIME     the newest, or the next if a call of that time, such as 47ms, then ends
+                          closer after an arrival (Li et al. 2020)
+  vot-realtime[:GRACE]    the VOT toolkit's rule: it skips frames, but never scores latency
+  package.module:object   your own
+latencies, each perhaps with ,init=TIME for the initialisation (constant:47ms,init=800ms):
+  recorded                each frame's recorded time
+  by-call                 the k-th call takes the k-th recorded time
+  constant:TIME           the same for all calls
+  resample:SEED           each call draws one of the recorded times
+  lognormal:SEED          each call draws from the lognormal distribution fitted to them
+  bootstrap:SEED[:BLOCK]  draws blocks of BLOCK (30) consecutive times: stalls stay together
+  package.module:object   your own
+conventions, by which toolkits count frames without a valid truth (AUC; DP) and thresholds:
+  pysot                   w, h > 0 is valid; else a miss of AUC, a hit of DP (PVT++, LAE-PVT)
+  elae                    as pysot, but x, y, w, h > 0 is valid
+  otb                     as elae; frame 0 is the truth's, sequences of score 0 leave the mean
+  lasot                   absent targets are left out of both, but divided by all frames
+  got10k                  frames without truth are left out; got10k-101: AUC of 101 thresholds
+  exclude                 frames without w, h > 0 are left out of both
 """
 
 
@@ -98,7 +114,7 @@ def parser() -> argparse.ArgumentParser:
         help="the same with the sign of sAP: frame i is queried at (i - eta) / fps",
     )
     add("--sigma-grid", action="store_true", help="add mAUC and mDP over sigma = 0, 0.02, ..., 1")
-    add("--convention", default="pysot", help="how frames and thresholds count (default: pysot)")
+    add("--convention", default="pysot", help="how frames count: see below (default: pysot)")
     add("--sequence", nargs="+", metavar="NAME", help="replay these sequences only")
     add_forecasting(made)
     output = made.add_argument_group("output")
@@ -256,19 +272,22 @@ def _print_tables(
     swept: Sequence[str],
     arguments: argparse.Namespace,
 ) -> None:
-    from lae_sim.report.replay import attribute_table, sequence_table, settings_text, summary_table
+    from lae_sim.report.replay import (
+        attribute_table,
+        closing_text,
+        sequence_table,
+        settings_text,
+        summary_table,
+    )
 
-    shown = sorted({float(sigma) for sigma in arguments.sigma})
+    shown, width = sorted({float(sigma) for sigma in arguments.sigma}), screen_width()
     for each in reports:
         if arguments.per_sequence:
-            print_text(f"{each['trace']}\n\n{sequence_table(each, shown, swept)}\n")
+            print_text(f"{each['trace']}\n\n{sequence_table(each, shown, swept, width)}\n")
         if arguments.attributes:
-            print_text(f"{each['trace']}\n\n{attribute_table(each, shown, swept)}\n")
-    print_text(summary_table(reports, trace_labels, shown, swept), end="\n\n")
+            print_text(f"{each['trace']}\n\n{attribute_table(each, shown, swept, width)}\n")
+    print_text(summary_table(reports, trace_labels, shown, swept, width), end="\n\n")
     for each in reports:
         print_text(settings_text(each))
-    if "fps" in swept:
-        print_text(
-            "a sweep of the rate is one of how fast the world moves: recorded frames arrive "
-            "faster, with the same motion from one to the next"
-        )
+    if closing := closing_text(reports, trace_labels, swept):
+        print_text(closing)

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 from lae_sim.cli.options import argument, exit_status, new_parser, print_json
 from lae_sim.engine.clock import whole
-from lae_sim.errors import LaeError
-from lae_sim.progress import print_text, tell
+from lae_sim.errors import LaeError, install
+from lae_sim.progress import print_text, screen_width, tell
 
 if TYPE_CHECKING:
     from lae_sim.study.records import Failure
 
 PROGRAM = "lae-sim study"
 
-EXAMPLES = """\
+EXAMPLES = f"""\
 examples:
   lae-sim study study.toml                                everything, on all cores of this machine
   lae-sim study study.toml --out figures --workers 2
@@ -25,7 +25,8 @@ examples:
 
 a study file (TOML); only traces is required, and all worlds, latencies, scales, forecasters and
 conventions are crossed:
-  traces = ["traces/*.parquet"]   files, folders, globs, URLs (s3://...: pip install fsspec s3fs)
+  traces = ["traces/*.parquet"]   files, folders, globs, URLs (s3://... needs
+                                  {install("remote")} s3fs)
   timing = ["jetson.parquet"]     other devices' times, for traces of their tracker and dataset
   forecasters = ["hold", "kalman"]       as in compare
   policies = ["latest"]                  as in replay
@@ -50,6 +51,7 @@ conventions are crossed:
   attributes = true                      in the report
   folds = 5                              of the training of forecasters that must be trained
   require_auc = 0.5                      how slow each tracker may be to have it; or a list of AUCs
+modules of your own, as in forecasters = ["mine:Damped:a=0.3"], are first looked for beside the file
 """
 
 
@@ -101,6 +103,6 @@ def _study(arguments: argparse.Namespace, failed: list[Failure]) -> None:
     else:
         from lae_sim.report.study_tables import study_text
 
-        print_text(study_text(results), end="\n\n")
+        print_text(study_text(results, screen_width()), end="\n\n")
         left = sorted(path.name for path in results.folder.glob("[!.]*"))
         print_text(f"{results.folder}: {', '.join(left)}")

@@ -15,7 +15,7 @@ from lae_sim.comparison.statistics import mean_over_sigmas
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.caveats import left_search, notes_on, search_notes
 from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
-from lae_sim.evaluation.metrics import METRICS, find_convention
+from lae_sim.evaluation.metrics import METRICS, UNSCORED, find_convention, is_scored
 from lae_sim.evaluation.modelled import Ranking
 from lae_sim.evaluation.totals import ModelledTotals, search_report
 from lae_sim.forecast.base import AnyFactory, Hold
@@ -73,8 +73,8 @@ def score_forecasters(
         ``attrs["ranking"]`` is the :class:`.modelled.Ranking`, as plain values.
 
     Raises:
-        LaeError: if there is no trace, the worlds differ in what they share, or whatever replaying,
-            training and scoring raise.
+        LaeError: if there is no trace, nothing can be scored, the worlds differ in what they share,
+            or whatever replaying, training and scoring raise.
     """
     if not traces:
         raise LaeError("there is nothing to compare: name at least one trace")
@@ -85,6 +85,8 @@ def score_forecasters(
     searches = {(each.passes, each.search, each.pre_forecaster, each.keep_size) for each in worlds}
     if len(searches) != 1:
         raise LaeError("the worlds must share their passes and their search model")
+    if not any(is_scored(recording.truth) for trace in traces.values() for recording in trace):
+        raise LaeError(f"nothing to compare: {UNSCORED}; lae-sim replay says how late answers are")
     sigmas, convention = worlds[0].sigmas, find_convention(worlds[0].convention)
     ready, notes = fitted(traces, {"hold": Hold, **forecasters}, worlds, folds, seed, progress)
     passes = passes_for(list(traces.values()), [open_trace(each) for each in worlds[0].passes])

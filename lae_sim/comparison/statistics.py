@@ -281,6 +281,10 @@ def summarise(
         f"resamples, seed {seed}; p: Wilcoxon's signed-rank test,\npaired over sequences, not "
         "corrected for the number of comparisons; +/-: sequences better and worse; n: sequences"
     )
+    if (summary["sequences"] == 1).all():
+        summary.attrs["method"] += (
+            "\none sequence alone: intervals have no width, and no test can tell anything apart"
+        )
     return summary
 
 

@@ -167,7 +167,8 @@ def _instead(root: Path) -> str | None:
             return f"{path} {other}"
     if table is not None:
         return f"is {table} a table? Name it <seq>.txt, a line x,y,w,h for each frame"
-    return None
+    inner = next(root.glob("*/*/groundtruth*.txt"), None)
+    return f"{inner.parents[1]} has some: give the folder of one dataset" if inner else None
 
 
 def _is_nested(folder: Path) -> bool:

@@ -106,6 +106,10 @@ def find_dataset(
     if not isinstance(root, (str, os.PathLike, type(None))):
         raise LaeError(f"root: the dataset's folder is a path, not {shown(root)}")
     if root is None:
+        if box is not None:
+            raise LaeError(
+                "--box is of a video or images of yours: name them with --root (root=...)"
+            )
         if name not in (None, "synthetic"):
             raise LaeError(
                 f"give the folder of {name} with --root (root=...); only synthetic needs none"
@@ -165,6 +169,8 @@ def _without_truth(
     frame_times: str | None,
 ) -> Dataset:
     """A video or a folder of images of which only the first box is known."""
+    if not root.exists():
+        raise LaeError(f"{root}: no such file or folder")
     sequence = root.resolve().stem if root.is_file() else root.resolve().name
     _choose(sequences, [sequence], str(root))
     if box is None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
+from lae_sim.errors import listed
 from lae_sim.evaluation.evaluate import ReplayStatistics, ScoredRun
 from lae_sim.evaluation.metrics import Convention
 from lae_sim.forecast.base import AnyFactory, notes_of
@@ -14,6 +15,30 @@ from lae_sim.trace.describe import STALL, in_ms
 from lae_sim.trace.metadata import Metadata
 
 TRUSTED_DISAGREEMENT = 0.05
+
+
+def at_the_floor(skip_rate: float, mismatch_mean: float) -> bool:
+    """Whether a tracker keeps up with the world, so that its answers are a frame old, no more."""
+    return skip_rate <= 0.05 and 0.9 <= mismatch_mean < 1.5
+
+
+def floor_notes(names: Iterable[str]) -> list[str]:
+    """Why trackers that keep up with the world lose all the same, in a sentence.
+
+    By the rule of pairing: at sigma 0 the query for frame i comes at its arrival, and an output is
+    of use from t_r = start + elapsed on, which is later if it is frame i's own.
+
+    Args:
+        names: of those :func:`at_the_floor` at sigma 0.
+    """
+    fast = listed(dict.fromkeys(names))
+    if not fast:
+        return []
+    return [
+        f"a floor of one frame for {fast}, though almost no frame is skipped: at sigma 0 an answer "
+        "is due as its frame arrives, before any tracker has processed it, so the best there is "
+        "comes from the frame before; at sigma 1 it is due a frame later"
+    ]
 
 
 class SkippedStalls:

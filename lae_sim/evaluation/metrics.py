@@ -149,6 +149,10 @@ def find_convention(name: str) -> Convention:
     return CONVENTIONS[name]
 
 
+UNSCORED = "no sequence has a ground truth after its first frame"
+"""Why there are no scores where :func:`is_scored` says so of all sequences."""
+
+
 def is_scored(truth: Floats) -> bool:
     """Whether a sequence has a truth to score by: one on any frame after the first.
 

@@ -159,7 +159,7 @@ class ModelledTotals:
     """Scores under the search model, added up over sequences.
 
     Attributes:
-        known: see :class:`.modelled.ModelledScores`.
+        known: see :class:`.modelled.ModelledScores`; None too as long as nothing is scored.
         applies: number of scored sequences whose replay is not exact.
         unexplained: see :class:`.modelled.ModelledScores`.
     """
@@ -178,7 +178,8 @@ class ModelledTotals:
         """Add the sequences of a part."""
         modelled, outputs = part.modelled, part.replay.processed
         if self.known is None:
-            self.known, self.unexplained = modelled.known, modelled.unexplained
+            self.known = modelled.known if part.replay.scored.any() else None
+            self.unexplained = modelled.unexplained
         self.applies += int((modelled.applies & part.replay.scored).sum())
         self._outputs += float(outputs.sum())
         self._lost_outputs += float(modelled.lost_share @ outputs)

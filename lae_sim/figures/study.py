@@ -119,7 +119,8 @@ def _curve_groups(view: View) -> list[tuple[list[Scores], str]]:
     """Scores whose curves are drawn together, and what was left out; what stands for all first."""
     groups: dict[tuple[Any, ...], list[Scores]] = {}
     for scores in view.results.scores:
-        groups.setdefault(scores.group, []).append(scores)
+        if scores.about[0]["curves"]["success"] is not None:  # something was scored
+            groups.setdefault(scores.group, []).append(scores)
     ordered = sorted(
         groups.values(), key=lambda group: not any(view.stands(view.row_of(s)) for s in group)
     )
@@ -315,11 +316,11 @@ def _draw_front(axes: Axes, view: View, points: Sequence[Point]) -> None:
 
 def _name_trackers(axes: Axes, view: View, points: Sequence[Point]) -> None:
     """A label beside each tracker's best point, moved up where one is too near below."""
-    # the worst first
-    best = {run_of(point.row): point for point in sorted(points, key=lambda point: point.auc)}
+    ordered = sorted(points, key=lambda point: point.auc)
+    best = {run_of(point.row): point for point in ordered}
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     taken: list[tuple[float, float]] = []
-    for run, point in best.items():
+    for run, point in sorted(best.items(), key=lambda each: each[1].auc):  # the worst first
         x, y, least = point.ms, point.auc, 0.055 * (high - low)
         for other, height in taken:
             if abs(other - x) < 0.4 * (right - left):

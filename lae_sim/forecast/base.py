@@ -43,6 +43,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.engine.arrivals import FrameTime
 from lae_sim.errors import LaeError, explained
+from lae_sim.plugins import bound, check_methods, with_options
 from lae_sim.trace.metadata import ImageSizes
 
 ImageSize = Optional[tuple[int, int]]
@@ -96,6 +97,9 @@ def resize(forecaster: Forecaster, image_sizes: ImageSizes | None, frame: float)
     """Tell a forecaster that follows it the size of a frame's image, if sizes change."""
     if image_sizes is not None and image_sizes.change and isinstance(forecaster, Resizable):
         forecaster.resize(image_sizes.at(frame))
+
+
+_METHODS = {"update": ("frame", "box"), "predict": ("frame",)}
 
 
 ForecasterFactory = Callable[[Sequence[float], ImageSize], Forecaster]
@@ -253,6 +257,29 @@ AnyFactory = ForecasterFactory | SequenceFactory
 def factory_for(factory: AnyFactory, sequence: Sequenced) -> ForecasterFactory:
     """The factory of a sequence's forecasters."""
     return factory.for_sequence(sequence) if isinstance(factory, SequenceFactory) else factory
+
+
+def own_factory(what: str, made: Any, options: Mapping[str, Any] | None = None) -> AnyFactory:
+    """The factory that something of a user's is, with options, checked to take what it is given.
+
+    Args:
+        what: what it is, for messages.
+        made: a class of forecasters, or a function that makes one, which takes the options beside
+            the box and the image size; an object that makes forecasters, or a class of such, which
+            takes the options alone.
+        options: keyword arguments.
+
+    Raises:
+        LaeError: if it does not take them, or its forecasters lack a method.
+    """
+    makes = isinstance(made, type) and not hasattr(made, "predict")
+    if makes and ("__call__" in dir(made) or (options and hasattr(made, "for_sequence"))):
+        made, options = bound(what, made, [], options or {}), None
+    if isinstance(made, SequenceFactory):
+        return made
+    if isinstance(made, type):
+        check_methods(what, made, _METHODS)
+    return with_options(what, made, options or {}, ("box", "image_size"))
 
 
 def notes_of(factory: Any, sequences: Sequence[str]) -> list[str]:
@@ -430,6 +457,7 @@ def _streamed(
             size = lanes.image_sizes[k]
             image_size = (int(size[0]), int(size[1])) if np.isfinite(size).all() else None
             forecaster = factory(lanes.boxes[fed].tolist(), image_size)
+            check_methods(name, forecaster, _METHODS)
         while fed < i:
             fed += 1
             resize(forecaster, lanes.resized.get(k), fed_frames[fed])

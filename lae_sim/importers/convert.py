@@ -302,9 +302,11 @@ def _every_frame(
         boxes = read_truth(truth.files[name], len(results.boxes))
         elapsed = _elapsed(name, source, results, given)
         if len(results.boxes) != len(boxes):
+            first = "if the first frame's box is missing, write the initial box above the others; "
             raise LaeError(
                 f"sequence {name!r}: {source.path} has {len(results.boxes)} boxes and "
-                f"{truth.files[name]} has {len(boxes)} rows of ground truth; give that of the "
+                f"{truth.files[name]} has {len(boxes)} rows of ground truth; "
+                f"{first if len(results.boxes) == len(boxes) - 1 else ''}give that of the "
                 f"same frames with --truth-file {name}=FILE, or leave it out with --exclude {name}"
             )
         if not given and results.elapsed_ns is not None:

@@ -45,11 +45,11 @@ class GivenTimes:
         if self.constant_ns is not None:
             return self.constant_ns
         if sequence not in self.per_sequence:
-            raise LaeError(f"{self.source}: no row for sequence {sequence!r}")
+            raise LaeError(f"{self.file}: no row for sequence {sequence!r}")
         stated, elapsed_ns = self.per_sequence[sequence]
         if stated not in (None, frames):
             raise LaeError(
-                f"{self.source}: sequence {sequence!r} has {stated} frames there and {frames} here"
+                f"{self.file}: sequence {sequence!r} has {stated} frames there and {frames} here"
             )
         return elapsed_ns
 
@@ -59,8 +59,8 @@ def given_times(text: str, tracker: str) -> GivenTimes | None:
 
     Args:
         text: ``measured``, ``constant:47ms``, ``mean-fps:120`` or ``mean-fps:FILE.csv`` (columns
-            sequence, fps and perhaps tracker, frames); all but the first may end in
-            ``,init=800ms``, what the initialisation takes.
+            sequence, fps and perhaps tracker, frames; or tracker and fps, one rate for all its
+            sequences); all but the first may end in ``,init=800ms``, what the initialisation takes.
         tracker: whose rows to take where the file has several trackers.
 
     Raises:
@@ -81,9 +81,13 @@ def given_times(text: str, tracker: str) -> GivenTimes | None:
     if not value.lower().endswith(".csv"):
         source = f"mean fps {value} given{init}, not measured per frame"
         return GivenTimes(source, frame_ns(parse_fps(value)), {}, init_ns)
-    source = f"mean fps of each sequence from {Path(value).name}{init}, not measured per frame"
-    rows = dict(_mean_fps_rows(Path(value), tracker))
-    return GivenTimes(source, None, rows, init_ns, Path(value))
+    path = Path(value)
+    rows = dict(_mean_fps_rows(path, tracker))
+    source = f"from {path.name}{init}, not measured per frame"
+    if None in rows:
+        return GivenTimes(f"mean fps of the tracker {source}", rows[None][1], {}, init_ns, path)
+    by_sequence = {name: time for name, time in rows.items() if name is not None}
+    return GivenTimes(f"mean fps of each sequence {source}", None, by_sequence, init_ns, path)
 
 
 def frame_ns(fps: Fraction) -> int:
@@ -97,31 +101,38 @@ def frame_ns(fps: Fraction) -> int:
     return fitting(round(10**9 / fps), f"a mean of {float(fps):g} fps")
 
 
-def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str, tuple[int | None, int]]]:
-    """Sequence, frames (if stated) and time in ns of each row of a table of mean fps."""
+def _mean_fps_rows(path: Path, tracker: str) -> Iterator[tuple[str | None, tuple[int | None, int]]]:
+    """Sequence, frames (if stated) and time in ns of each row of a table of mean fps.
+
+    Without a column of sequences, the tracker's only row is that of sequence None.
+    """
     try:
         rows = list(csv.DictReader(io.StringIO(read_text(path, Budget(path)), newline="")))
     except csv.Error as error:
         raise LaeError(f"{path}: cannot be read: {error}") from error
-    if not rows or not {"sequence", "fps"} <= set(rows[0]):
-        raise LaeError(f"{path}: needs a header with the columns sequence and fps")
+    if not rows or "fps" not in rows[0] or not {"sequence", "tracker"} & set(rows[0]):
+        raise LaeError(
+            f"{path}: needs a header with the columns sequence and fps, or tracker and fps, "
+            "separated by commas"
+        )
     trackers = sorted({row["tracker"] or "" for row in rows if "tracker" in row})
     if trackers and tracker not in trackers:
         raise LaeError(
             f"{path}: has {listed(trackers)}, not {shown(tracker)}; if it is there under another "
-            "name, give that with --tracker"
+            "name, give that with --tracker; if it is not, add its rate or give --time mean-fps:120"
         )
     seen = set()
     for number, row in enumerate(rows, 2):
         if row.get("tracker", tracker) != tracker:
             continue
-        if row["sequence"] in seen:
+        sequence = row.get("sequence")
+        if sequence in seen:
             raise LaeError(
-                f"{path}, line {number}: a second row for {shown(row['sequence'])}; keep one"
+                f"{path}, line {number}: a second row for {shown(sequence or tracker)}; keep one"
             )
-        seen.add(row["sequence"])
+        seen.add(sequence)
         try:
             frames = int(row["frames"]) if row.get("frames") else None
-            yield row["sequence"], (frames, frame_ns(parse_fps(row["fps"] or "")))
+            yield sequence, (frames, frame_ns(parse_fps(row["fps"] or "")))
         except (LaeError, ValueError) as error:
             raise LaeError(f"{path}, line {number}: {error}") from error

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.decoding import Budget, TooLargeError
-from lae_sim.errors import LaeError, one_line
+from lae_sim.errors import LaeError, install, one_line
 
 if TYPE_CHECKING:
     import h5py
@@ -42,8 +42,8 @@ def load_hdf5(path: Path) -> dict[str, Any]:
         import h5py
     except ImportError as error:
         raise LaeError(
-            f"{path}: a MATLAB file of version 7.3: install lae-sim[mat73] to read it, or save it "
-            "in MATLAB with save(..., '-v7')"
+            f"{path}: a MATLAB file of version 7.3: to read it {install('mat73')}, or save it in "
+            "MATLAB with save(..., '-v7')"
         ) from error
     try:
         with h5py.File(path, "r") as file:

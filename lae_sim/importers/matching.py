@@ -78,10 +78,14 @@ def match_results(
     if not matched or (missing and not skip_missing):
         raise LaeError(
             f"{truth.root}: no ground truth for {listed(sorted(missing))}, of {len(sources)} "
-            "results; "
-            + (f"--skip-missing leaves them out{apart}" if matched else "is it the right dataset?")
+            "results; " + (f"--skip-missing leaves them out{apart}" if matched else _known(truth))
         )
     return Matched(matched, chosen, sorted(missing), others, unnamed)
+
+
+def _known(truth: GroundTruth) -> str:
+    """What to check where no result is of a sequence of the ground truth."""
+    return f"is it the right dataset? It has {listed(sorted(truth.files), 3)}: name files so"
 
 
 def _by_tracker(

@@ -32,7 +32,7 @@ forecasters:
   oracle                  the truth: the ceiling
   camera+NAME             any of these over the camera's motion (needs the frames: --root)
   guarded+NAME            any of these, but held where it has lately done worse than hold
-  package.module:factory  your own
+  package.module:factory  your own, perhaps with parameters: mine:Damped:a=0.3,steps=2
 """
 
 BUILT_IN = (
@@ -52,7 +52,8 @@ COMPARED = ("learned", "kalman", "least-squares", "tuned-kalman")  # unless othe
 def load_forecaster(name: str, camera: Camera | None = None) -> AnyFactory:
     """A forecaster by its name, or a user's own as ``package.module:factory``.
 
-    Modules are also looked for in the current folder.
+    Modules are also looked for in the current folder, and parameters of one's own follow its name:
+    ``mine:Damped:a=0.3,steps=2``.
 
     Args:
         name: as in ``FORECASTERS``.
@@ -130,10 +131,13 @@ def load_any(name: str, camera: Camera | None = None) -> AnyFactory | Trainer:
         )
         known = hint(name, (*BUILT_IN, "tuned-kalman", "trained"))
         raise LaeError(f"no {what}: there are {names}, and package.module:factory{known}")
-    factory: AnyFactory | Trainer = imported(what, name)
-    if isinstance(factory, type) and hasattr(factory, "fit"):
-        factory = bound(what, factory, [], {})
-    return factory
+    made, options = imported(what, name)
+    if hasattr(made, "fit"):
+        trainer: Trainer = bound(what, made, [], options) if isinstance(made, type) else made
+        return trainer
+    from lae_sim.forecast.base import own_factory
+
+    return own_factory(what, made, options)
 
 
 def find_camera(

@@ -12,7 +12,7 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, install
 from lae_sim.forecast.base import AnyFactory, ForecasterFactory
 from lae_sim.forecast.kalman import PAPER
 from lae_sim.forecast.learned import (
@@ -150,7 +150,7 @@ def import_torch() -> Any:
     try:
         import torch
     except ImportError as error:
-        raise LaeError("training needs torch: pip install 'lae-sim[torch]'") from error
+        raise LaeError(f"training needs torch: {install('torch')}") from error
     return torch
 
 

@@ -57,7 +57,7 @@ from lae_sim.profile.passes import (
 from lae_sim.profile.timed import TimedTracker
 from lae_sim.profile.translation import Translated
 from lae_sim.profile.worker import InProcess, Worker
-from lae_sim.progress import ProgressBar, tell
+from lae_sim.progress import ProgressBar, ShowProgress, tell
 from lae_sim.replay.latency import time_label
 from lae_sim.replay.strides import phases
 from lae_sim.replay.world import flag, named, parse_policy, several, text
@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 MODES = ("every-frame", "real-time")
-_FAILURES = 20  # of a pass that are told one by one
+_FAILURES = 20  # that are told one by one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +224,7 @@ def profile_tracker(
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
     force: bool = False,
-    progress: bool | None = None,
+    progress: ShowProgress = None,
     **settings: Any,
 ) -> Profile:
     """Run a tracker on this device and write a trace of each pass.
@@ -240,7 +240,8 @@ def profile_tracker(
         force: whether to replace what is there already, be it a trace of another tracker or
             dataset, or no trace.
         progress: whether to show a progress bar, and what a user should know besides; by default
-            on a terminal and in a notebook.
+            on a terminal and in a notebook; or a function, which is told:
+            ``progress(done, total, what)``.
         settings: attributes of :class:`ProfilePlan`, as :meth:`ProfilePlan.of` takes them.
 
     Raises:
@@ -356,17 +357,17 @@ def _run(
                 interrupted = error
     with _kept(unfinished):
         written = [t for t in passes if write_pass(t, journal, failures.get(t.name, []))]
-    if not interrupted:
+    if not interrupted or not written:
         journal.remove()
     failed = tuple(failure for each in failures.values() for failure in each)
-    for each in failures.values():
-        for failure in each[:_FAILURES]:
-            notice(f"failed: {failure.reason}")
-        if len(each) > _FAILURES:
-            notice(f"failed: and {len(each) - _FAILURES:,} more")
+    reasons = list(dict.fromkeys(failure.reason for failure in failed))  # passes fail alike
+    for reason in reasons[:_FAILURES]:
+        notice(f"failed: {reason}")
+    if len(reasons) > _FAILURES:
+        notice(f"failed: and {len(reasons) - _FAILURES:,} more")
     if interrupted:
-        kept = f"{path} holds what is complete; " if written else ""
-        notice(f"{kept}--resume goes on")
+        kept = f"{path} holds what is complete; --resume goes on"
+        notice(kept if written else "no sequence is complete yet: nothing is kept")
         raise interrupted
     if not written:
         raise LaeError("no sequence could be profiled")

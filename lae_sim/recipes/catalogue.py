@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, hint, listed, shown
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -266,6 +266,9 @@ def find_recipe(name: str, recipes: Iterable[Recipe] | None = None) -> Recipe:
     known = {recipe.name: recipe for recipe in recipes or list_recipes()}
     folded = name.casefold() if isinstance(name, str) else ""
     if folded not in known:
+        within = [each for each in known if each.startswith(f"{folded.rstrip('/*')}/")]
+        if within:
+            raise LaeError(f"{shown(name)} is a dataset; name its trackers: {listed(within)}")
         meant = hint(folded, known) or "; lae-sim get lists those there are"
         raise LaeError(f"no recipe {shown(name)}{meant}")
     return known[folded]

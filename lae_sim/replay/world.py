@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import product
@@ -19,7 +19,7 @@ from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError, hint, shown
 from lae_sim.files import sequence_names
 from lae_sim.forecast.base import AnyFactory
-from lae_sim.plugins import bound, imported
+from lae_sim.plugins import bound, imported, with_options
 from lae_sim.replay import latency as sources
 from lae_sim.replay.latency import (
     Constant,
@@ -410,7 +410,8 @@ def open_others(
 def parse_policy(text: str) -> Policy:
     """A policy by name.
 
-    A user's own is named ``package.module:object``: a policy, or a class that makes one.
+    A user's own is named ``package.module:object``: a policy, or a class that makes one; parameters
+    may follow, as in ``mine:Patient:frames=2``.
 
     Raises:
         LaeError: if there is none of that name, or its value does not fit.
@@ -427,7 +428,7 @@ def parse_policy(text: str) -> Policy:
     if name == "vot-realtime":
         return policies.vot_realtime(*([_number(text, value)] if value else []))
     if colon and name not in ("latest", "fifo", "shrinking-tail"):
-        policy: Policy = _plugin("policy", text, _POLICIES)
+        policy: Policy = _plugin("policy", text, _POLICIES, ("clock", "calls"))
         return policy
     raise LaeError(
         f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
@@ -438,8 +439,9 @@ def parse_policy(text: str) -> Policy:
 def parse_latency(text: str) -> LatencySource:
     """A latency source by name.
 
-    A user's own is named ``package.module:object``: a source, or a class that makes one. Every name
-    may end in ``,init=TIME``, what the initialisation takes: ``constant:47ms,init=800ms``.
+    A user's own is named ``package.module:object``: a source, or a class that makes one; parameters
+    may follow, as in ``mine:Jitter:ms=40,seed=3``. Every name may end in ``,init=TIME``, what the
+    initialisation takes: ``constant:47ms,init=800ms``.
 
     Raises:
         LaeError: if there is none of that name, or its value does not fit.
@@ -462,9 +464,12 @@ def parse_latency(text: str) -> LatencySource:
         seed, *block = value.split(":", 1)
         return sources.bootstrap(_number(text, seed), *(_number(text, n, least=1) for n in block))
     if colon and name not in ("recorded", "by-call"):
-        source: LatencySource = _plugin("latency", text, _LATENCIES)
+        source: LatencySource = _plugin("latency", text, _LATENCIES, ("recording",))
         return source
-    meant = f"; did you mean constant:{text:.40}?" if text[:1].isdigit() else hint(name, _LATENCIES)
+    meant = hint(name, _LATENCIES)
+    if text[:1].isdigit():
+        unit = "" if text[-1:].isalpha() else "ms"
+        meant = f"; did you mean constant:{text:.40}{unit}?"
     raise LaeError(
         f"no latency {shown(text)}: there are recorded, by-call, constant:47ms, resample:SEED, "
         f"lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object, all of them perhaps with "
@@ -583,13 +588,22 @@ def kind_of(label: str) -> str:
     return re.split("[:,]", label, maxsplit=1)[0]
 
 
-def _plugin(what: str, text: str, known: Iterable[str]) -> Any:
-    """What a user made, or an instance of it if it is a class."""
+def _plugin(what: str, text: str, known: Iterable[str], arguments: Sequence[str]) -> Any:
+    """What a user made, or an instance of it if it is a class, with options; checked.
+
+    Args:
+        what: what it is.
+        text: its name.
+        known: what else may have been meant.
+        arguments: names of those that it will be called with.
+    """
     try:
-        made = imported(f"{what} {text!r}", text)
+        made, options = imported(f"{what} {text!r}", text)
     except LaeError as error:
         raise LaeError(f"{error}{hint(text.partition(':')[0], known)}") from error
-    return bound(f"{what} {text!r}", made, [], {}) if isinstance(made, type) else made
+    if isinstance(made, type):
+        made, options = bound(f"{what} {text!r}", made, [], options), {}
+    return with_options(f"{what} {text!r}", made, options, arguments)
 
 
 def _number(text: str, value: str, least: int = 0) -> int:

@@ -40,12 +40,13 @@ if TYPE_CHECKING:
 Row = Mapping[str, Any]
 
 
-def comparison_table(summary: pd.DataFrame) -> str:
+def comparison_table(summary: pd.DataFrame, width: int | None = None) -> str:
     """The summary as text: a line per trace, setting and forecaster, then how it was computed.
 
     The first metric has intervals and tests, the others have their means; the search model's means
     have its own intervals. ``summary`` is what :func:`summarise` or :func:`by_attribute` gave, or
-    some rows of it, perhaps with the columns of the model.
+    some rows of it, perhaps with the columns of the model. ``width`` is as of
+    :func:`lae_sim.report.table.text_of`.
     """
     first, *others = summary["metric"].unique()
     baselines = [name[3:-7] for name in summary if name.endswith("_better")]
@@ -65,12 +66,13 @@ def comparison_table(summary: pd.DataFrame) -> str:
 
     columns = [
         *(Column(name, name, is_label=True) for name in labels),
-        Column("n", "sequences"),
-        Column(METRIC_LABELS.get(first, first), "mean", SCORE),
+        Column("n", "sequences", importance=3),
+        Column(METRIC_LABELS.get(first, first), "mean", SCORE, importance=9),
         Column("recovered", "recovered", Number(".1f", 100, "%", ".0f")),
         *(column for baseline in baselines for column in _against(baseline)),
-        *(Column(METRIC_LABELS.get(name, name), mean_of(name), SCORE) for name in others),
-    ]
+        *(Column(METRIC_LABELS.get(name, name), mean_of(name), SCORE, importance=4)
+          for name in others),
+    ]  # fmt: skip
     modelled = [
         name[:-4] for name in summary if name.startswith("modelled_") and name[-4:] == "_low"
     ]
@@ -93,7 +95,7 @@ def comparison_table(summary: pd.DataFrame) -> str:
     intervals = [METRIC_LABELS.get(name, name) for name in (first, *modelled)]
     caption = ", ".join(shared) + "\n\n" if shared else ""
     method = f"\n{summary.attrs['method']}" if "method" in summary.attrs else ""
-    return caption + text_of(Table.of(columns, rows), [*intervals, "recovered"]) + method
+    return caption + text_of(Table.of(columns, rows), [*intervals, "recovered"], width) + method
 
 
 def paper_tables(
@@ -200,15 +202,18 @@ def _ends(name: str, row: Row) -> str | None:
 def _against(baseline: str) -> list[Column]:
     """The mean paired difference to a baseline, its p, the sequences better and worse."""
     name = f"vs_{baseline}"
+    importance = 8 if baseline == "hold" else 2
 
     def where_known(text: Callable[[Row], str]) -> Callable[[Row], str | None]:
         return lambda row: None if is_unknown(row[name]) else text(row)
 
     return [
-        Column(f"vs {baseline}", name, SIGNED),
-        Column("p", where_known(lambda row: p_label(row[f"{name}_p"]))),
-        Column("+/-", where_known(lambda row: f"{row[f'{name}_better']}/{row[f'{name}_worse']}")),
-    ]
+        Column(f"vs {baseline}", name, SIGNED, importance=importance),
+        Column("p", where_known(lambda row: p_label(row[f"{name}_p"])),
+               name=f"p vs {baseline}", importance=importance - 1),
+        Column("+/-", where_known(lambda row: f"{row[f'{name}_better']}/{row[f'{name}_worse']}"),
+               name=f"+/- vs {baseline}", importance=2),
+    ]  # fmt: skip
 
 
 _REPLAYED = ("closed_loop", "forecaster", "replay")
@@ -227,12 +232,15 @@ _FIDELITY = {
     "d_dp20": ("d", SIGNED),
     "covered_dp20": ("covered", PERCENT),
 }
+_IMPORTANT = {"mean_abs_d_auc": 9, "auc": 8, "closed_auc": 8, "d_auc": 7, "covered": 7}
 
 
-def fidelity_table(rows: Sequence[FidelityRow] | Sequence[FidelitySummary]) -> str:
+def fidelity_table(
+    rows: Sequence[FidelityRow] | Sequence[FidelitySummary], width: int | None = None
+) -> str:
     """How far replays are from closed loops: a line per closed loop, forecaster and replay.
 
-    Of rows per sequence, a line each.
+    Of rows per sequence, a line each. ``width`` is as of :func:`lae_sim.report.table.text_of`.
     """
     each = isinstance(rows[0], FidelityRow)
     labels = [*_REPLAYED, "sequence"] if each else _REPLAYED
@@ -240,20 +248,26 @@ def fidelity_table(rows: Sequence[FidelityRow] | Sequence[FidelitySummary]) -> s
     if not each:
         columns.append(Column("sequences", "sequences"))
     columns += [
-        Column(title, key, _yes_or_no if each and key.startswith("covered") else form)
+        Column(
+            title,
+            key,
+            _yes_or_no if each and key.startswith("covered") else form,
+            name=f"{title} of DP" if key.endswith("_dp20") else title,
+            importance=_IMPORTANT.get(key, 3 if key.endswith("dp20") else 5),
+        )
         for key, (title, form) in _FIDELITY.items()
         if any(getattr(row, key, None) is not None for row in rows)
     ]
     if each:
         columns += [Column("parted at", "parted"), Column("disagree", "disagreement", SCORE)]
-    return text_of(Table.of(columns, rows))
+    return text_of(Table.of(columns, rows), width=width)
 
 
 def _yes_or_no(value: bool) -> str:
     return "yes" if value else "no"
 
 
-def spread_table(spreads: Sequence[ClosedLoopSpread]) -> str:
+def spread_table(spreads: Sequence[ClosedLoopSpread], width: int | None = None) -> str:
     """How far closed loops of one setting are apart: a line per setting and sequence."""
     several = {each.trace for each in spreads}
     columns = [Column("trace", "trace", is_label=True)] if len(several) > 1 else []
@@ -266,7 +280,7 @@ def spread_table(spreads: Sequence[ClosedLoopSpread]) -> str:
         Column("highest", "auc_high", SCORE),
         Column("apart", "spread", SCORE),
     ]
-    return text_of(Table.of(columns, spreads))
+    return text_of(Table.of(columns, spreads), width=width)
 
 
 _KINDS = {"strided": "strided passes", "every-frame": "recorded boxes alone"}

@@ -164,12 +164,8 @@ def _facts(view: View) -> dict[str, str]:
         "by Holm's method for the number of those compared with the best",
         "made with": f"lae_sim {__version__}",
     }
-    made_up = [
-        f"{source.input.label}: {source.metadata.timing_note}"
-        for source in results.plan.sources
-        if source.metadata.timing_note
-    ]
-    return {**facts, **({"times": "; ".join(made_up)} if made_up else {})}
+    times = "; ".join(results.timing_sources())
+    return {**facts, **({"times": times} if times else {})}
 
 
 def _search_facts(results: StudyResults) -> dict[str, str]:

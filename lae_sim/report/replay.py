@@ -16,7 +16,7 @@ import numpy as np
 
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import visible
-from lae_sim.evaluation.caveats import left_search, search_notes
+from lae_sim.evaluation.caveats import at_the_floor, floor_notes, left_search, search_notes
 from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED
@@ -264,7 +264,7 @@ SWEPT = {"fps": "fps", "latency_scale": "scale"}
 
 
 _FRAMES = Number(".3f", unit=" fr")
-_SIGMA = Column("sigma", "sigma", Number("g"))
+_SIGMA = Column("sigma", "sigma", Number("g"), importance=9)
 
 Line = ChainMap[str, Any]
 """What a line of a table shows, then the result that it is from, and the report of the trace."""
@@ -282,14 +282,18 @@ def _lines(reports: Iterable[tuple[str, Report]], shown_sigmas: Sequence[float])
 
 
 def _text(
-    columns: Iterable[Column], lines: Iterable[Line], title: str, swept: Sequence[str]
+    columns: Iterable[Column],
+    lines: Iterable[Line],
+    title: str,
+    swept: Sequence[str],
+    width: int | None,
 ) -> str:
     labels = [
         Column(title, "label", is_label=True),
         Column("forecaster", "forecaster", is_label=True),
-        *(Column(SWEPT[key], key) for key in swept),
+        *(Column(SWEPT[key], key, importance=9) for key in swept),
     ]
-    return text_of_records([*labels, *columns], lines)
+    return text_of_records([*labels, *columns], lines, width)
 
 
 def summary_table(
@@ -297,6 +301,7 @@ def summary_table(
     labels: Sequence[str],
     shown_sigmas: Sequence[float],
     swept: Sequence[str] = (),
+    width: int | None = None,
 ) -> str:
     """One line per report, forecaster and permitted latency.
 
@@ -305,27 +310,37 @@ def summary_table(
         labels: the trace's name for each report.
         shown_sigmas: permitted latencies to show.
         swept: those of ``SWEPT`` that get a column.
+        width: letters that a line may have (see :func:`lae_sim.report.table.text_of`).
     """
     columns = [_SIGMA] if len(shown_sigmas) > 1 or shown_sigmas != [0.0] else []
-    for title, metric in (("AUC", "auc"), ("DP@20", "dp20")):
+    for title, metric, more in (("AUC", "auc", 3), ("DP@20", "dp20", 0)):
         columns += [
-            Column(title, metric, FINE_SCORE),
-            Column("offline", f"offline_{metric}", FINE_SCORE),
-            Column("change", partial(_change, metric), CHANGE),
-            Column("recov.", f"recovered_{metric}", PERCENT),
-        ]
+            Column(title, metric, FINE_SCORE, importance=9),
+            Column("offline", f"offline_{metric}", FINE_SCORE, name=f"{title} offline",
+                   importance=2 + more),
+            Column("change", partial(_change, metric), CHANGE, name=f"{title} change",
+                   importance=1 + more),
+            Column("recov.", f"recovered_{metric}", PERCENT, name=f"{title} recov.",
+                   importance=3 + more),
+        ]  # fmt: skip
         if any(result["modelled"] for report in reports for result in report["results"]):
-            columns.append(Column("modelled", partial(_modelled_of, metric), FINE_SCORE))
+            columns.append(
+                Column("modelled", partial(_modelled_of, metric), FINE_SCORE,
+                       name=f"{title} modelled", importance=4 + more)
+            )  # fmt: skip
             if metric == "auc":  # that of DP would make the line too long
-                columns.append(Column("[low, high]", _interval_of))
+                columns.append(Column("[low, high]", _interval_of, importance=3))
     if any("mauc" in result for report in reports for result in report["results"]):
-        columns += [Column("mAUC", "mauc", FINE_SCORE), Column("mDP", "mdp", FINE_SCORE)]
+        columns += [
+            Column("mAUC", "mauc", FINE_SCORE, importance=8),
+            Column("mDP", "mdp", FINE_SCORE, importance=8),
+        ]
     columns += [
-        Column("tracker", "tracker_fps", Number(".1f", unit=" fps")),
-        Column("skipped", "skip_rate", PERCENT),
-        Column("mismatch", "mismatch_mean", _FRAMES),
+        Column("tracker", "tracker_fps", Number(".1f", unit=" fps"), importance=2),
+        Column("skipped", "skip_rate", PERCENT, importance=3),
+        Column("mismatch", "mismatch_mean", _FRAMES, importance=4),
     ]
-    return _text(columns, _lines(zip(labels, reports), shown_sigmas), "trace", swept)
+    return _text(columns, _lines(zip(labels, reports), shown_sigmas), "trace", swept, width)
 
 
 def _modelled_of(metric: str, line: Line) -> float | None:
@@ -341,6 +356,22 @@ def _interval_of(line: Line) -> str | None:
 
 def _change(metric: str, line: Line) -> float | None:
     return relative_change(line[metric], line.get(f"offline_{metric}"))
+
+
+def closing_text(reports: Sequence[Report], labels: Sequence[str], swept: Sequence[str]) -> str:
+    """What there is to say of all traces together, in lines; empty if nothing."""
+    notes = floor_notes(
+        label
+        for label, report in zip(labels, reports)
+        for result in report["results"]
+        if result["sigma"] == 0 and at_the_floor(report["skip_rate"], result["mismatch_mean"])
+    )
+    if "fps" in swept:
+        notes.append(
+            "a sweep of the rate is one of how fast the world moves: recorded frames arrive "
+            "faster, with the same motion from one to the next"
+        )
+    return "\n".join(fill(note, 100, break_on_hyphens=False) for note in notes)
 
 
 def settings_text(report: Report) -> str:
@@ -390,7 +421,10 @@ def _wrapped(note: str) -> str:
 
 
 def attribute_table(
-    report: Report, shown_sigmas: Sequence[float], swept: Sequence[str] = ()
+    report: Report,
+    shown_sigmas: Sequence[float],
+    swept: Sequence[str] = (),
+    width: int | None = None,
 ) -> str:
     """One line per attribute and forecaster."""
     columns = [
@@ -405,17 +439,22 @@ def attribute_table(
         for line in _lines([("", report)], shown_sigmas)
         for name, scores in line.get("attributes", {}).items()
     ]
-    return _text(columns, sorted(lines, key=itemgetter("label")), "attribute", swept)
+    return _text(columns, sorted(lines, key=itemgetter("label")), "attribute", swept, width)
 
 
-def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequence[str] = ()) -> str:
+def sequence_table(
+    report: Report,
+    shown_sigmas: Sequence[float],
+    swept: Sequence[str] = (),
+    width: int | None = None,
+) -> str:
     """One line per sequence and forecaster."""
     columns = [
         _SIGMA,
-        Column("AUC", "auc", FINE_SCORE),
-        Column("offline", "offline_auc", FINE_SCORE),
-        Column("DP@20", "dp20", FINE_SCORE),
-        Column("offline", "offline_dp20", FINE_SCORE),
+        Column("AUC", "auc", FINE_SCORE, importance=9),
+        Column("offline", "offline_auc", FINE_SCORE, name="AUC offline"),
+        Column("DP@20", "dp20", FINE_SCORE, importance=8),
+        Column("offline", "offline_dp20", FINE_SCORE, name="DP@20 offline"),
         Column("frames", "world_frames"),
         Column("processed", "processed"),
         Column("init", "init_ms", Number(".1f", unit=" ms")),
@@ -432,7 +471,7 @@ def sequence_table(report: Report, shown_sigmas: Sequence[float], swept: Sequenc
         for rows in by_sequence
         for line, scores in zip(lines, rows)
     )
-    return _text(columns, records, "sequence", swept)
+    return _text(columns, records, "sequence", swept, width)
 
 
 _SETTING = {

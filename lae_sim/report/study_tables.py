@@ -93,32 +93,36 @@ _COUNT, _MS, _RATIO, _RECOVERED = (
     Number(".0f"), Number(".1f"), Number(".2f"), Number(".1f", 100, "%", ".0f")
 )  # fmt: skip
 _RANKING = (
-    Column("n", "sequences", _COUNT, "number of sequences"),
-    Column("AUC", "auc", SCORE, "with its 95 % interval over sequences"),
-    Column("modelled", "modelled_auc", SCORE, "AUC under the search model, with its interval"),
-    Column("ranked by", "ranked_by", meaning="whose AUC is ranked, compared and tested"),
+    Column("n", "sequences", _COUNT, "number of sequences", importance=3),
+    Column("AUC", "auc", SCORE, "with its 95 % interval over sequences", importance=9),
+    Column("modelled", "modelled_auc", SCORE, "AUC under the search model, with its interval",
+           importance=8),
+    Column("ranked by", "ranked_by", meaning="whose AUC is ranked, compared and tested",
+           importance=2),
     Column("jitter", _jitter, meaning="the range of 95 % of the repetitions' AUC",
-           name="auc_jitter"),
+           name="auc_jitter", importance=3),
     Column("offline", "offline_auc", SCORE, "AUC without latency"),
     Column("change", lambda row: relative_change(row["ranked_auc"], row["offline_auc"]), CHANGE,
            "of the AUC, to offline", name="auc_change"),
     Column("recovered", "recovered_auc", _RECOVERED,
            "share of the AUC lost to latency that the forecaster wins back"),
-    Column("vs hold", "vs_hold_auc", SIGNED, "AUC won over hold"),
+    Column("vs hold", "vs_hold_auc", SIGNED, "AUC won over hold", importance=7),
     Column("p", "vs_hold_auc_p", p_label, "of no difference to hold: Wilcoxon's signed-rank test "
-           "over sequences, not corrected"),
-    Column("vs best", "vs_best_auc", SIGNED, "AUC to the best of the same setting and sequences"),
+           "over sequences, not corrected", importance=6),
+    Column("vs best", "vs_best_auc", SIGNED, "AUC to the best of the same setting and sequences",
+           importance=6),
     Column("p (best)", "vs_best_auc_p_holm", p_label, "of no difference to the best: the same "
            "test, corrected by Holm's method for the number of those compared with it"),
     Column("DP", "dp20", SCORE, "precision at 20 px"),
     Column("modelled DP", "modelled_dp20", SCORE, "under the search model"),
     Column("lost", "lost_share", PERCENT, "share of the outputs answered while the target is lost"),
     Column("offline DP", "offline_dp20", SCORE, "without latency"),
-    Column("ms/call", "elapsed_ms", _MS, "mean processing time"),
-    Column("init ms", "init_ms", _MS, "mean time of an initialisation; the notes say where from"),
+    Column("ms/call", "elapsed_ms", _MS, "mean processing time", importance=6),
+    Column("init ms", "init_ms", _MS, "mean time of an initialisation; the notes say where from",
+           importance=2),
     Column("skipped", "skip_rate", PERCENT, "share of frames never processed"),
     Column("age ms", "age_ms", _COUNT, "mean age of the outputs that answer, at the first sigma; "
-           "what forecasting costs is not in it"),
+           "what forecasting costs is not in it", importance=4),
     Column("stale ms", "longest_stale_ms", _COUNT, "longest time that one output answered"),
     Column("failed", "failed", PERCENT,
            "share of sequences in which an answer misses the target wholly"),
@@ -458,8 +462,13 @@ def write_tables(results: StudyResults | View, folder: str | os.PathLike[str]) -
         write_table(table, Path(folder))
 
 
-def study_text(results: StudyResults | View) -> str:
-    """The tables for a terminal, then what they rest on."""
+def study_text(results: StudyResults | View, width: int | None = None) -> str:
+    """The tables for a terminal, then what they rest on.
+
+    Args:
+        results: of a study, or a view of them.
+        width: as of :func:`lae_sim.report.table.text_of`.
+    """
     view = results if isinstance(results, View) else View(results)
     results, tables = view.results, [ranking(view, _TERMINAL, most=MOST_ROWS)]
     repeated = any(row.repetitions > 1 for row in view.rows)
@@ -469,7 +478,7 @@ def study_text(results: StudyResults | View) -> str:
         tables.append(required_table(view).first(MOST_ROWS, "required.csv"))
     parts = ["\n".join(filled(line) for line in results.verdict())]
     for table in tables:
-        text = text_of(table, intervals=_INTERVALS)
+        text = text_of(table, intervals=_INTERVALS, width=width)
         text = text.replace("★", "*")  # not every terminal has stars
         parts.append("\n".join([table.caption, text, legend_of(table)]))
     parts += ["\n".join(map(filled, shortfalls(results.required, view.names)))]

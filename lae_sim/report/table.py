@@ -108,6 +108,8 @@ class Column:
         is_label: whether it names the rows; such columns come first, and are left-aligned.
         group: a heading above this and the neighbouring columns of the same group.
         name: its heading in CSV and Parquet, if it is not the name of the value.
+        importance: where there is no room for all columns, those of the least are left out; 5 is
+            that of most.
     """
 
     title: str
@@ -117,6 +119,7 @@ class Column:
     is_label: bool = False
     group: str = ""
     name: str = ""
+    importance: int = 5
 
     @property
     def key(self) -> str:
@@ -204,12 +207,14 @@ class Table:
         return [(title, len(list(members))) for title, members in groupby(titles)]
 
 
-def text_of(table: Table, intervals: Container[str] | None = None) -> str:
+def text_of(table: Table, intervals: Container[str] | None = None, width: int | None = None) -> str:
     """A table as aligned text, for a terminal.
 
     Args:
         table: the table.
         intervals: titles of the columns that show their intervals; by default all.
+        width: columns of letters that it may take; as many as it needs if None. Where they do not
+            suffice, names are shortened and columns left out, of which a line below says.
     """
 
     def text(column: Column, cell: Cell) -> str:
@@ -217,14 +222,93 @@ def text_of(table: Table, intervals: Container[str] | None = None) -> str:
         return column.form(cell.value) if left_out else cell.text
 
     lines = [[*map(text, table.columns, row)] for row in table.rows]
-    return aligned(table.header, lines, table.labels)
+    return _fitted(table.columns, lines, width)
 
 
-def text_of_records(columns: Sequence[Column], records: Iterable[Any]) -> str:
-    """The text of the table of these records, of which no more is kept than their texts."""
+def text_of_records(
+    columns: Sequence[Column], records: Iterable[Any], width: int | None = None
+) -> str:
+    """The text of the table of these records, of which no more is kept than their texts.
+
+    Args:
+        columns: of the table.
+        records: a row each.
+        width: as of :func:`text_of`.
+    """
     lines = [[column.cell(record).text for column in columns] for record in records]
+    return _fitted(columns, lines, width)
+
+
+_LONG, _SHORT = 24, 12
+"""Letters to which names are shortened for the sake of any column, and of the most important."""
+_MOST_IMPORTANT = 8
+
+
+def _fitted(columns: Sequence[Column], lines: Iterable[Sequence[str]], width: int | None) -> str:
+    """Columns of text that fit a width, and which were left out for that.
+
+    Args:
+        columns: what they are; those that name the rows come first.
+        lines: a text for each column.
+        width: in letters; None if there is room for all.
+    """
     labels = sum(column.is_label for column in columns)
-    return aligned([column.title for column in columns], lines, labels)
+    texts = [[*map(visible, each)] for each in zip((column.title for column in columns), *lines)]
+    if width is None:
+        return aligned(*_lines_of(texts), labels)
+
+    def size(c: int) -> int:
+        return max(map(len, texts[c]))
+
+    def excess(shown: Container[int]) -> int:
+        """By how many letters these columns are too wide."""
+        widths = [size(c) + 2 for c in range(len(columns)) if c in shown]
+        return sum(widths) - 2 - width
+
+    def shorten(shown: Container[int], least: int) -> None:
+        """Shorten the longest names as far as is needed, to no less than so many letters."""
+        for c in sorted(range(labels), key=size, reverse=True):
+            over = excess(shown)
+            if over > 0:
+                texts[c] = _shortened(texts[c], max(size(c) - over, least, len(columns[c].title)))
+
+    shorten(range(len(columns)), _LONG)
+    shown = {*range(labels)}
+    for c in sorted(range(labels, len(columns)), key=lambda c: (-columns[c].importance, c)):
+        before = [*texts]
+        if columns[c].importance >= _MOST_IMPORTANT:
+            shorten({*shown, c}, _SHORT)
+        if excess({*shown, c}) <= 0 or len(shown) == labels:
+            shown.add(c)
+        else:
+            texts = before
+    text = aligned(*_lines_of([texts[c] for c in sorted(shown)]), labels)
+    titles = [column.title for column in columns]
+    missing = [
+        (each.name if titles.count(each.title) > 1 else "") or each.title
+        for c, each in enumerate(columns)
+        if c not in shown
+    ]
+    if not missing:
+        return text
+    said = f"left out for want of room: {', '.join(missing)}; --json has all of it"
+    return f"{text}\n{textwrap.fill(said, max(width, 40), break_on_hyphens=False)}"
+
+
+def _lines_of(texts: Sequence[Sequence[str]]) -> tuple[Sequence[str], list[Sequence[str]]]:
+    """The header and the lines of columns."""
+    header, *lines = map(list, zip(*texts))
+    return header, [*lines]
+
+
+def _shortened(names: list[str], most: int) -> list[str]:
+    """Names of at most so many letters, or of some more where they would be the same."""
+    for size in range(most, max(map(len, names))):
+        end = (size - 3) // 2
+        cut = [n if len(n) <= size else f"{n[: size - 3 - end]}...{n[-end:]}" for n in names]
+        if len({*cut}) == len({*names}):
+            return cut
+    return names
 
 
 def legend_of(table: Table) -> str:

@@ -193,20 +193,25 @@ def _stalls(stalls: list[dict[str, Any]]) -> list[str]:
     return [*lines, ""]
 
 
-def profile_table(passes: Sequence[PassSummary]) -> str:
-    """What a profile's passes left: a line per trace."""
+def profile_table(passes: Sequence[PassSummary], width: int | None = None) -> str:
+    """What a profile's passes left: a line per trace.
+
+    Args:
+        passes: what they left.
+        width: as of :func:`lae_sim.report.table.text_of`.
+    """
     ms = Number(".2f")
     columns = [
         Column("trace", "trace", is_label=True),
         Column("sequences", "sequences", COUNT),
         Column("frames", "world_frames", COUNT),
-        Column("processed", "processed", COUNT),
-        Column("lost", "lost", COUNT),
+        Column("processed", "processed", COUNT, importance=3),
+        Column("lost", "lost", COUNT, importance=3),
         Column("init ms", "init_ms", ms),
-        Column("median ms", "median_ms", ms),
+        Column("median ms", "median_ms", ms, importance=9),
         Column("p95 ms", "p95_ms", ms),
     ]
-    return text_of(Table.of(columns, passes))
+    return text_of(Table.of(columns, passes), width=width)
 
 
 @styled

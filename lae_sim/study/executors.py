@@ -15,7 +15,7 @@ from itertools import islice
 from typing import Any, Protocol, TypeVar
 
 from lae_sim.decoding import allowing
-from lae_sim.errors import LaeError, one_line, shown
+from lae_sim.errors import LaeError, install, one_line, shown
 
 AHEAD = 3
 """Tasks that are handed out for each worker, so that none waits and few results are held."""
@@ -154,7 +154,7 @@ def _cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
         from distributed.comm import get_address_host_port
     except ImportError as error:
         raise LaeError(
-            "--scheduler needs Dask: pip install 'lae-sim[distributed]', here and on the workers"
+            f"--scheduler needs Dask: {install('distributed')}, here and on the workers"
         ) from error
     log = logging.getLogger("distributed.client")
     level = log.level

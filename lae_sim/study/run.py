@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
 from lae_sim.errors import LaeError
+from lae_sim.evaluation.caveats import at_the_floor, floor_notes
 from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
@@ -159,15 +160,33 @@ class StudyResults:
         rankings = dict.fromkeys(rankings_of(self.scores).values())
         return [str(ranking) for ranking in rankings if ranking.reason]
 
+    def timing_sources(self) -> list[str]:
+        """Where the times of traces are from, as far as these say so."""
+        return self._of_traces(
+            (source.input.label, f"times: {source.metadata.timing_note}")
+            for source in self.plan.sources
+            if source.metadata.timing_note
+        )
+
     def search_sources(self) -> list[str]:
-        """What is known of the reach of the tracker of each trace, where something is modelled."""
-        sources = {
-            f"{scores.setting.trace.label}: modelled: {about['modelled']['source']}": None
+        """What is known of the reach of the trackers of traces, where something is modelled."""
+        return self._of_traces(
+            (scores.setting.trace.label, f"modelled: {about['modelled']['source']}")
             for scores in self.scores
             for about in scores.about
             if about["modelled"]
-        }
-        return list(sources)
+        )
+
+    def _of_traces(self, said: Iterable[tuple[str, str]]) -> list[str]:
+        """What is said of traces by their labels, each once, and of which of them."""
+        labels: dict[str, dict[str, None]] = {}
+        for label, text in said:
+            labels.setdefault(text, {})[label] = None
+        count = len(self.plan.sources)
+        return [
+            f"{'all traces' if len(some) == count > 1 else ', '.join(some)}: {text}"
+            for text, some in labels.items()
+        ]
 
     def notes(self) -> list[str]:
         """What keeps the figures from being what their names promise, each once."""
@@ -179,10 +198,7 @@ class StudyResults:
             for dataset, sequences in members.items()
             if len(sequences) > 1
         ]
-        for source in self.plan.sources:
-            if source.metadata.timing_note:
-                notes.append(f"{source.input.label}: times: {source.metadata.timing_note}")
-        notes += [*self.init_sources(assumed=True), *self.training]
+        notes += [*self.timing_sources(), *self.init_sources(assumed=True), *self.training]
         notes += self.search_sources()
         if any(scores.known is False for scores in self.scores):
             notes.append(
@@ -192,6 +208,12 @@ class StudyResults:
         notes += [
             note for scores in self.scores for about in scores.about for note in about["notes"]
         ]
+        notes += floor_notes(
+            row.trace + (f" x {row.scale}" if row.scale != 1 else "")
+            for row in self.summary
+            if row.sigma == 0 and row.staleness
+            if at_the_floor(row.skip_rate, row.staleness.mismatch_mean)
+        )
         for trace in self.traces:
             notes += [f"{trace['trace']}: {text}" for text in trace["warnings"]]
         return list(dict.fromkeys(notes))

@@ -18,6 +18,7 @@ from lae_sim.engine.clock import exact, parse_duration, parse_fps, split_init, w
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
+from lae_sim.plugins import looking_in
 from lae_sim.replay.search import parse_search
 from lae_sim.replay.world import (
     check_sigmas,
@@ -188,7 +189,7 @@ def is_random(latency: str) -> bool:
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
-    """Read a study from a TOML file; local traces are relative to its folder.
+    """Read a study from a TOML file; local traces, and modules of yours, are found in its folder.
 
     Args:
         path: of the file.
@@ -218,7 +219,8 @@ def read_study(path: str | os.PathLike[str]) -> Study:
             raise RecursionError
         # numbers stay as they are written: no float comes between
         document = tomllib.loads(content, parse_float=str)
-        return Study.of(document)
+        with looking_in(Path(path).parent):
+            return Study.of(document)
     except RecursionError as error:
         raise LaeError(f"{path}: is nested too deeply for a study") from error
     except (ValueError, LaeError) as error:  # ValueError also of a number of thousands of digits

@@ -304,9 +304,10 @@ def shortfalls(required: Sequence[Requirement], names: Names) -> list[str]:
 
     Of the most rows that can be said; the last line counts the others.
     """
+    where = [f", {each}" if each else "" for each in _in_words([_setting(r) for r in required])]
     said = [
-        f"{_pair(row, names)}, AUC {row.required_auc:.3g}: {'; '.join(parts)}"
-        for row in required
+        f"{_pair(row, names)}{setting}, AUC {row.required_auc:.3g}: {'; '.join(parts)}"
+        for row, setting in zip(required, where)
         if (parts := [*_stretches(row), *_cliff(row)])
     ]
     if len(said) > MOST_SHORTFALLS:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lae_sim.errors import LaeError, TraceError, one_line
+from lae_sim.errors import LaeError, TraceError, install, one_line
 from lae_sim.files import check_regular
 
 BLOCK = 8 << 20  # bytes read at once; s3fs would take 50 MiB, several times over
@@ -34,7 +34,10 @@ def find_traces(patterns: Sequence[str], base: Path | None = None) -> list[str]:
         with _explained(pattern):
             names = _remote(pattern) if is_url(pattern) else _local(pattern, base)
         if not names:
-            raise LaeError(f"{pattern}: no trace is there (of a folder, *.parquet are taken)")
+            raise LaeError(
+                f"{pattern}: no trace is there (of a folder, *.parquet are taken; lae-sim convert "
+                "makes traces of a toolkit's results)"
+            )
         for name in sorted(names):
             same = name.removeprefix("file://")
             traces.setdefault(same if is_url(same) else os.path.realpath(same), name)
@@ -161,8 +164,8 @@ def _explained(path: str) -> Iterator[None]:
         raise TraceError(f"{path}: no such file{why}") from error
     except ImportError as error:
         missing = getattr(error.__cause__ or error, "name", None)
-        package = "'lae-sim[remote]'" if missing == "fsspec" else missing
-        raise LaeError(f"{path}: {error}: pip install {package}") from error
+        command = install("remote") if missing == "fsspec" else f"pip install {missing}"
+        raise LaeError(f"{path}: {error}: {command}") from error
     except Exception as error:
         raise LaeError(f"{path}: cannot be read ({_line(error)})") from error
 

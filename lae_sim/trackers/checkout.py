@@ -13,7 +13,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, install
 from lae_sim.errors import explained as raised
 
 _PACKAGES = {
@@ -44,7 +44,7 @@ def torch_on(device: str) -> Any:
     try:
         import torch
     except ImportError as error:
-        raise LaeError("this tracker needs PyTorch: pip install 'lae-sim[torch]'") from error
+        raise LaeError(f"this tracker needs PyTorch: {install('torch')}") from error
     kind, _, index = device.partition(":")
     if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
         raise LaeError(f"device {device!r}: it is cpu, cuda or cuda:N")

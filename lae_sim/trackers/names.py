@@ -6,7 +6,7 @@ import importlib
 from typing import Any, Mapping
 
 from lae_sim.errors import LaeError
-from lae_sim.plugins import bound, imported
+from lae_sim.plugins import bound, check_methods, imported
 from lae_sim.trackers.protocol import Tracker
 
 NAMES = "dcf, nanotrack, opencv:NAME, pysot, pytracking, trax:COMMAND, package.module:factory"
@@ -28,12 +28,12 @@ def make_tracker(name: str, options: Mapping[str, Any]) -> Tracker:
 
     Args:
         name: such as ``"dcf"`` or ``"opencv:mil"``. Modules are also looked for in the current
-            folder.
+            folder, and options may follow: ``"mine:Bright:reach=40"``.
         options: keyword arguments of the factory.
 
     Raises:
-        LaeError: if there is none of that name, it cannot be imported, or it does not take the
-            options.
+        LaeError: if there is none of that name, it cannot be imported, it does not take the
+            options, or its methods do not take what they are given.
     """
     kind, colon, value = name.partition(":")
     if kind in _BUILT_IN and bool(value) == (kind in _TAKE_ARGUMENT):
@@ -41,8 +41,10 @@ def make_tracker(name: str, options: Mapping[str, Any]) -> Tracker:
         factory = getattr(importlib.import_module("lae_sim.trackers." + module), attribute)
         positional = [value] if value else []
     elif colon and kind not in _BUILT_IN:
-        factory, positional = imported(f"tracker {name!r}", name), []
+        factory, own = imported(f"tracker {name!r}", name)
+        positional, options = [], {**own, **options}
     else:
         raise LaeError(f"no tracker {name!r}: there are {NAMES}")
     tracker: Tracker = bound(f"tracker {name!r}", factory, positional, options)
+    check_methods(f"tracker {name!r}", tracker, {"init": ("frame", "box"), "track": ("frame",)})
     return tracker

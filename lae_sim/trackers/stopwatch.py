@@ -146,7 +146,10 @@ def _checked(output: Any) -> tuple[list[float] | None, float | None]:
     if box is not None:
         numbers = box if isinstance(box, (list, tuple)) else ()
         if len(numbers) != 4 or not all(_is_number(v) and abs(v) <= LARGEST for v in numbers):
-            raise LaeError(f"answered {shown(output)}, not a box of four finite numbers")
+            wrong = f"answered {shown(output)}, not a box of four finite numbers"
+            if isinstance(box, bool):
+                wrong += "; of OpenCV's (found, box) answer the box, or None if it is not found"
+            raise LaeError(wrong)
         box = [float(v) for v in numbers]
     return box, _score(score)
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, install
 from lae_sim.trackers.protocol import Box, Image, Output
 
 FOLDER = "lae-sim-trax-"
@@ -48,7 +48,7 @@ class Trax:
         try:
             import trax.client
         except ImportError as error:
-            raise LaeError(f"TraX is missing ({error}): pip install 'lae-sim[trax]'") from error
+            raise LaeError(f"TraX is missing ({error}): {install('trax')}") from error
         self._trax: Any = trax
         self._command = command
         self._parameters = {name: str(value) for name, value in parameters.items()}

@@ -144,6 +144,9 @@ def test_a_progress_bar_counts_steps(capsys: pytest.CaptureFixture[str]) -> None
     out, err = capsys.readouterr()
     assert out == ""
     assert "4/4" in err
+    told = []
+    lae_sim.compare_forecasters(SLOW, forecasters="kalman", progress=lambda *e: told.append(e))
+    assert told == [(1, 1, "synthetic-slow.parquet, recorded")]
 
 
 FAR = {"latency": "constant:90ms,init=600ms", "sequences": ("bike-pan", "car-chase", "truck-far")}

@@ -450,6 +450,14 @@ def test_a_progress_bar_counts_world_frames(capsys: pytest.CaptureFixture[str]) 
     assert "1.20k/1.20k" in err
     lae_sim.evaluate(SLOW, progress=False)
     assert capsys.readouterr() == ("", "")
+    told = []
+    lae_sim.evaluate(SLOW, sequences="boat-calm", progress=lambda *each: told.append(each))
+    assert told == [(300, 300, "")]
+    assert capsys.readouterr() == ("", "")
+    with pytest.raises(
+        lae_sim.LaeError, match="progress: 'yes' is neither true, false nor a function"
+    ):
+        lae_sim.evaluate(SLOW, progress="yes")
 
 
 def test_a_video_without_truth_shows_itself_without_a_score(tmp_path: Path) -> None:
@@ -462,3 +470,7 @@ def test_a_video_without_truth_shows_itself_without_a_score(tmp_path: Path) -> N
     assert repr(result).endswith(": AUC hold -, kalman ->")
     assert result.summary[["auc", "dp20", "offline_auc"]].isna().all(axis=None)
     assert "nan" not in result._repr_html_().lower()
+    with pytest.raises(
+        lae_sim.LaeError, match="nothing to draw: no sequence has a ground truth after"
+    ):
+        result.plot()

@@ -83,6 +83,23 @@ def test_an_open_trace_stands_for_its_file(tmp_path: Path) -> None:
     assert [source.input.path for source in results.plan.sources] == [str(SLOW)]
 
 
+def test_a_video_without_truth_has_a_report_of_its_times(tmp_path: Path) -> None:
+    trace = lae_sim.read_trace(SLOW, ["boat-calm"])
+    [one] = trace
+    one.truth[1:] = float("nan")
+    path = tmp_path / "video.parquet"
+    lae_sim.write_trace(lae_sim.Trace(trace.metadata, [one]), path)
+    results = lae_sim.run_study(
+        traces=path, scales=[0.5, 1], folder=tmp_path / "out", workers=1, require_auc=0.5
+    )
+    assert results.to_frame()["auc"].isna().all()
+    assert "no ground truth after the first frame" in " ".join(results.notes())
+    assert not any("measure c" in note for note in results.notes())
+    figures = [path.stem for path in (results.folder / "figures").glob("*.pdf")]
+    assert any(name.startswith("times-") for name in figures)
+    assert not any(name.startswith("success-") for name in figures)
+
+
 def test_displays(results: lae_sim.StudyResults) -> None:
     assert repr(results) == f"<StudyResults of 8 settings, 8 cells in {results.folder}>"
     html = results._repr_html_()
@@ -107,3 +124,8 @@ def test_a_progress_bar(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     out, err = capsys.readouterr()
     assert out == ""
     assert "100%" in err
+    told = []
+    lae_sim.run_study(**keys, folder=tmp_path / "c", progress=lambda *each: told.append(each))
+    done, total, what = told[-1]
+    assert (done, what) == (total, "summing up")
+    assert [each[:2] for each in told[:-1]] == [(k, total) for k in range(1, total + 1)]

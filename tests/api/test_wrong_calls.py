@@ -38,7 +38,10 @@ NO_UNIT = "is not a duration: write it with its unit, such as 47ms"
 TRACES_AS_GIVEN = [
     ("x.parquet", "traces: x.parquet: no such file"),
     ("", "no such file"),
-    (str(TRACES / "cases"), "cases: no trace is there"),
+    (
+        str(TRACES / "cases"),
+        "cases: no trace is there (of a folder, *.parquet are taken; lae-sim convert makes",
+    ),
     (str(TRACES / "FORMAT.md"), "FORMAT.md: not a readable Parquet file"),
     (None, "traces: name at least one"),
     ([], "traces: name at least one"),
@@ -58,7 +61,7 @@ SETTINGS: list[tuple[dict[str, Any], str]] = [
     ({"forecasters": 3}, "forecasters: 3 is neither a name nor makes forecasters"),
     ({"forecasters": {"mine": 3}}, "forecasters: 3 is neither"),
     ({"forecasters": {3: lae_sim.Hold}}, "forecasters: the name of a forecaster is text, not 3"),
-    ({"forecasters": int}, "forecasters: the class int has no update and no predict"),
+    ({"forecasters": int}, r"forecasters: int has no method update\(frame, box\)"),
     ({"forecasters": {"hold": lae_sim.Kalman}}, "forecasters: 'hold' is the baseline"),
     (
         {"forecasters": [lambda box, size: lae_sim.Hold(box), lambda box, size: None]},
@@ -74,7 +77,8 @@ SETTINGS: list[tuple[dict[str, Any], str]] = [
     ({"sigma": []}, "sigma: name at least one permitted latency"),
     ({"latency": 47}, "latency: 47 is not a name, such as 'recorded' or 'constant:47ms'"),
     ({"latency": 0.047}, "latency: 0.047 is not a name"),
-    ({"latency": "47ms"}, "latency: no latency '47ms': there are recorded"),
+    ({"latency": "47ms"}, "latency: no latency '47ms': there are .*; did you mean constant:47ms?"),
+    ({"latency": "47"}, "latency: no latency '47': there are .*; did you mean constant:47ms?"),
     ({"latency": "constant:47"}, f"latency: '47' {NO_UNIT}"),
     ({"latency": "recrded"}, "latency: .*; did you mean 'recorded'?"),
     ({"latency": "bootstrap"}, "latency: 'bootstrap' needs a whole number from 0"),
@@ -228,7 +232,7 @@ def test_studies(keys: dict[str, Any], message: str) -> None:
     [
         ({}, "the key 'traces' is missing"),
         ({"study": "missing.toml"}, "missing.toml: no such file"),
-        ({"study": SLOW}, "name traces by traces=..."),
+        ({"study": SLOW}, r'name traces by traces=... .in a TOML file: traces = \["a.parquet"'),
         ({"study": [SLOW]}, "study: .* name traces by traces=..."),
         ({"study": 3}, "study: 3 is no TOML file"),
         ({"study": "a.toml", "traces": SLOW}, "traces: give a study, or its keys, not both"),

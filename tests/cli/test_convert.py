@@ -247,7 +247,7 @@ def test_lengths_are_checked(world, convert):
     write(world / "KCF" / "a_time.txt", [0.02] * 5)
     _, _, err = convert("KCF")
     assert "a.txt has 5 boxes and" in err
-    assert "has 6 rows of ground truth" in err
+    assert "has 6 rows of ground truth; if the first frame's box is missing, write" in err
     assert "--truth-file a=FILE" in err
     write(world / "a5.txt", TRUTH[:5])
     assert convert("KCF", "--truth-file", f"a={world / 'a5.txt'}")[0] == 0
@@ -324,7 +324,10 @@ def test_other_errors(world, convert):
 
 def test_another_dataset(world, convert):
     write(world / "E" / "x.txt", TRUTH)
-    assert "no ground truth for a, b, of 2 results; is it the" in convert("KCF", truth="E")[2]
+    assert (
+        "no ground truth for a, b, of 2 results; is it the right dataset? It has "
+        in convert("KCF", truth="E")[2]
+    )
 
 
 def test_two_files_for_one_sequence(world, convert):

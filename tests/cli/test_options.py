@@ -1,5 +1,7 @@
 import os
+import re
 import signal
+import sys
 import time
 from fractions import Fraction
 from pathlib import Path
@@ -14,7 +16,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.files import written_whole
 from lae_sim.replay.latency import bootstrap, lognormal, resampled
-from lae_sim.replay.world import parse_latency, parse_policy
+from lae_sim.replay.world import _LATENCIES, _POLICIES, parse_latency, parse_policy
 
 RECORDING = lae_sim.Recording.new(
     "sequence", [[0, 0, 1, 1]] * 4, [[0, 0, 1, 1]] * 4, [90_000_000, 40_000_000, 30_000_000, 2]
@@ -60,6 +62,7 @@ def double(recording):
 def test_a_policy_of_ones_own(name, tmp_path, monkeypatch):
     (tmp_path / "own_rules.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_rules", raising=False)
     policy = parse_policy(f"own_rules:{name}")
     assert policy(Clock.at(Fraction(1)), [(0, 0, 7)]) == (9, 9_000_000_007)
     assert scores_latency(policy)
@@ -68,6 +71,7 @@ def test_a_policy_of_ones_own(name, tmp_path, monkeypatch):
 def test_a_latency_of_ones_own(tmp_path, monkeypatch):
     (tmp_path / "own_rules.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_rules", raising=False)
     assert times(parse_latency("own_rules:double")) == [180_000_000, 60_000_000, 4]
     assert times(parse_latency("own_rules:double,init=9ns")) == [9, 60_000_000, 4]
     [world] = lae_sim.World.sweep(latency="own_rules:double,init=9ns")
@@ -116,6 +120,16 @@ def test_a_latency_that_is_none_is_an_error(text):
         parse_latency(text)
 
 
+def test_an_option_that_is_none_is_told_what_was_perhaps_meant(capsys):
+    for words, meant in (
+        (["--forecasters", "kalman"], "--forecaster"),
+        (["--latncy=47ms"], "--latency"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["replay", "a.parquet", *words])
+        assert f"; did you mean '{meant}'? (lae-sim replay --help" in capsys.readouterr().err
+
+
 def test_running_out_of_memory_is_one_line(capsys):
     def python():
         raise MemoryError
@@ -137,10 +151,24 @@ def test_every_command_takes_what_a_file_may_take(tmp_path, capsys):
         with pytest.raises(SystemExit):
             main([*command, "--max-decoded", "much"])
         assert "--max-decoded: 'much' is no size in memory" in capsys.readouterr().err
-    for command in COMMANDS:
-        with pytest.raises(SystemExit):
-            main([command, "--help"])
-        assert "--max-decoded SIZE" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_every_command_has_what_all_have_and_examples(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    printed = capsys.readouterr().out
+    assert "--max-decoded SIZE" in printed
+    assert f"\nexamples:\n  lae-sim {'profile' if command == 'fidelity' else command} " in printed
+    assert max(map(len, printed.splitlines())) <= 100
+
+
+def test_the_help_of_replay_explains_every_policy_latency_and_convention(capsys):
+    with pytest.raises(SystemExit):
+        main(["replay", "--help"])
+    printed = capsys.readouterr().out
+    for name in (*_POLICIES, *_LATENCIES, *lae_sim.CONVENTIONS):
+        assert re.search(rf"^  {name}\b.* {{2}}\w.+|; {name}: \w+", printed, re.M), name
 
 
 POSIX = pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows has no SIGHUP")

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import io
 import json
+import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import command_line
 import pytest
+from command_line import ENVIRONMENT, run_here
+from places import REPOSITORY
 from witness import moving
 
 from lae_sim.cli.main import COMMANDS
@@ -20,6 +26,7 @@ from lae_sim.progress import OutputError, ProgressBar, print_text, tell
 from lae_sim.trace.file import Trace, write_trace
 from lae_sim.trace.metadata import Metadata
 
+SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
 HOSTILE = "=a\x1b[2J\r\u202e[red]x[bold] 追é.parquet"
 SEEN = r"=a\x1b[2J\r\u202e[red]x[bold] 追é"
 
@@ -279,3 +286,29 @@ def test_a_long_command_is_refused_shortly(capsys: pytest.CaptureFixture[str]) -
     with pytest.raises(SystemExit):
         importlib.import_module("lae_sim.cli.main").main(["x" * 100_000])
     assert 0 < len(capsys.readouterr().err) < 2000
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="Windows has no such terminals")
+def test_tables_fit_the_terminal_and_are_whole_through_a_pipe() -> None:
+    import fcntl
+    import struct
+    import termios
+
+    terminal, screen = os.openpty()
+    fcntl.ioctl(screen, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    words = command_line.command("replay", SLOW, "--sequence", "boat-calm")
+    environment = {name: ENVIRONMENT[name] for name in ENVIRONMENT if name != "COLUMNS"}
+    with subprocess.Popen(words, stdout=screen, stderr=screen, env=environment) as process:
+        os.close(screen)
+        printed = b""
+        with contextlib.suppress(OSError):  # Linux says so that the other end is closed
+            while more := os.read(terminal, 65536):
+                printed += more
+    os.close(terminal)
+    assert process.returncode == 0, printed
+    table, said = printed.decode().replace("\r", "").split("left out for want of room: ")
+    assert all(len(line) <= 80 for line in table.splitlines())
+    assert "DP@20 offline" in said.partition("; --json has all of it")[0]
+    whole = run_here("replay", SLOW, "--sequence", "boat-calm").stdout
+    assert "mismatch" in whole.splitlines()[0]
+    assert "want of room" not in whole

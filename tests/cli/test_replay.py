@@ -345,7 +345,8 @@ def test_a_forecaster_of_ones_own(tmp_path):
     error = replay(SLOW, "--forecaster", "mine:broken", cwd=tmp_path, status=2)
     assert "mine:broken: predicted" in error
     error = replay(SLOW, "--forecaster", "mine:one_argument", cwd=tmp_path, status=2)
-    assert "mine:one_argument: TypeError: " in error
+    assert "one_argument(box) (" in error
+    assert "mine.py, line 11) is called as one_argument(box, image_size): too many" in error
     assert "no-such" in replay(SLOW, "--forecaster", "no-such", status=2)
     assert "ModuleNotFoundError" in replay(
         SLOW, "--forecaster", "no_such:thing", status=2, run=run_process
@@ -452,6 +453,8 @@ def test_a_video_without_truth_has_no_score(tmp_path, convention, options):
     assert lines
     assert all(line.count("-") >= 8 and "nan" not in line for line in lines)
     assert "1 of 1 sequences have no ground truth after the first frame" in " ".join(out.split())
+    assert report["search"] is None  # of scores that there are not, the model says nothing
+    assert "--gaps" not in out
 
 
 def test_attributes_that_there_are_not_make_an_empty_table():
@@ -613,3 +616,15 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     timeline = ["--timeline", str(tmp_path / "timeline.svg"), "--search", "off"]
     assert replay_command.main([str(SLOW), *timeline]) == 0
     assert calls == {"simulate": 8, "pair": 1, "forecast": 2}
+
+
+def test_a_fast_tracker_is_told_of_the_floor_of_one_frame():
+    floor = "a floor of one frame for synthetic-fast.parquet, though almost no frame is skipped"
+    both = replay(SLOW, FAST)
+    assert " ".join(both.split()).count(floor) == 1
+    assert "floor" not in replay(SLOW)
+    assert "floor" not in replay(FAST, "--sigma", "1")
+    assert "floor" not in replay(FAST, "--latency-scale", "9", "--policy", "fifo")
+    assert "floor" not in replay(FAST, "--policy", "vot-realtime")
+    for result in replay_json(FAST, "--latency", "constant:1ns")["traces"][0]["results"]:
+        assert 0.99 < result["mismatch_mean"] < 1  # all but frame 0's answer, on time

@@ -53,20 +53,6 @@ class EveryOther:
 
 policy = EveryOther()
 
-class Deadly:
-    def __init__(self, box, image_size=None):
-        import os
-        os.kill(os.getpid(), 9)
-
-class Confused:
-    def __init__(self, box, image_size=None):
-        raise ZeroDivisionError("of my own")
-
-def lazy(box, image_size=None, step=1):
-    return Stay(box)
-
-partial = functools.partial(lazy, step=2)
-
 class Stay:
     def __init__(self, box, image_size=None):
         self.box = box
@@ -74,6 +60,20 @@ class Stay:
         pass
     def predict(self, frame):
         return self.box
+
+class Deadly(Stay):
+    def __init__(self, box, image_size=None):
+        import os
+        os.kill(os.getpid(), 9)
+
+class Confused(Stay):
+    def __init__(self, box, image_size=None):
+        raise ZeroDivisionError("of my own")
+
+def lazy(box, image_size=None, step=1):
+    return Stay(box)
+
+partial = functools.partial(lazy, step=2)
 """
 
 
@@ -369,7 +369,7 @@ def test_a_known_reach_ranks_by_the_model_and_an_assumed_one_does_not(tmp_path: 
         a, b = (table.loc[(pair.search, each, pair.forecaster), name] for each in (pair.a, pair.b))
         assert pair.ranked_by == by_search[pair.search]
         assert pair.difference.value == pytest.approx(a.mean() - b.mean())
-    assert "synthetic-slow: modelled: c = 0.3, as given" in results.notes()
+    assert "all traces: modelled: c = 0.3, as given" in results.notes()
     assert results.ranked_by() == [
         "ranked by the modelled scores: the reach is given or measured",
         "ranked by the scores of the recorded boxes: the reach is unknown, and the model's are for "
@@ -397,7 +397,7 @@ def test_the_tables_and_the_page_say_by_what_they_rank(tmp_path: Path) -> None:
     assert caption.endswith("sigma 0, modelled scores")
     assert "Trackers against each other, by the modelled AUC" in one
     page = (tmp_path / "study-results" / "report.html").read_text()
-    assert "synthetic-slow: modelled: c = 0.3, as given" in page
+    assert "all traces: modelled: c = 0.3, as given" in page
     assert "ranked by the modelled scores: the reach is given or measured" in page
     assert ", of the recorded boxes" in page  # the curves
     ranking = pd.read_csv(tmp_path / "study-results" / "tables" / "ranking.csv")
@@ -534,8 +534,10 @@ def test_what_the_means_rest_on_is_said(tmp_path: Path) -> None:
     study = Study((str(FAST), str(few)), sequences=(), costs=("kalman=2ms",))
     notes = run(tmp_path / "out", study).notes()
     assert "synthetic: its traces do not have the same sequences: compare no means" in notes
-    assert "few: times: synthetic (made up, not measured)" in notes
+    assert "all traces: times: synthetic (made up, not measured)" in notes
     assert "answers come later by what forecasting costs: kalman 2000 us" in notes
+    floor = "a floor of one frame for synthetic-fast, though almost no frame is skipped: "
+    assert [note.startswith(floor) for note in notes if "floor" in note] == [True]
 
 
 # ------------------------------------------------------------------------------ resuming

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -202,6 +203,10 @@ def test_what_cannot_be_compared(slow: Trace) -> None:
     alone = read_trace(TRACES / "synthetic-slow.parquet", SEQUENCES[:1])
     with pytest.raises(LaeError, match="only one video"):
         score_forecasters({"slow": alone}, {"tuned-kalman": load_any("tuned-kalman")})
+    [one] = alone
+    bare = replace(alone, recordings=[replace(one, truth=np.full_like(one.truth, np.nan))])
+    with pytest.raises(LaeError, match="nothing to compare: no sequence has a ground truth"):
+        score_forecasters({"slow": bare}, {"tuned-kalman": load_any("tuned-kalman")})
 
 
 def test_a_sequence_without_truth_has_no_value_where_the_convention_leaves_it_out() -> None:

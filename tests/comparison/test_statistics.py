@@ -24,8 +24,9 @@ from lae_sim.comparison.statistics import (
     summarise,
 )
 from lae_sim.errors import LaeError
+from lae_sim.figures.labels import setting_label
 from lae_sim.report.comparison import comparison_table
-from lae_sim.report.table import p_label, setting_label
+from lae_sim.report.table import p_label
 
 KEYS = ["trace", "latency", "scale", "sigma", "forecaster", "metric"]
 
@@ -237,7 +238,10 @@ def test_a_baseline_that_is_not_there():
 
 
 def test_one_sequence_has_no_width_and_no_evidence():
-    found = row(summarise(tidy(random_scores(count=1))))
+    alone = summarise(tidy(random_scores(count=1)))
+    assert "one sequence alone" in alone.attrs["method"]
+    assert "alone" not in summarise(tidy(random_scores(count=2))).attrs["method"]
+    found = row(alone)
     for name in ("mean", "vs_hold", "recovered"):
         prefix = "" if name == "mean" else f"{name}_"
         assert found[f"{prefix}low"] == pytest.approx(found[name])

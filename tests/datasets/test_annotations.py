@@ -85,6 +85,9 @@ def test_several_sets_of_annotations(tmp_path):
 def test_nothing_found(tmp_path):
     with pytest.raises(LaeError, match="no ground truth found"):
         find_truth(tmp_path)
+    make(tmp_path, "sets/DTB70/Gull2/groundtruth_rect.txt")
+    with pytest.raises(LaeError, match=r"DTB70 has some: give the folder of one dataset"):
+        find_truth(tmp_path / "sets")
     with pytest.raises(LaeError, match="no such folder"):
         find_truth(tmp_path / "none")
 

@@ -302,6 +302,10 @@ def test_what_is_missing_is_named(tmp_path, walk):
         find_dataset(root=tmp_path, sequences=["walk", "wakl"])
     with pytest.raises(LaeError, match="has ground truth; --box is for images without"):
         find_dataset(root=walk, box=(1, 2, 3, 4))
+    with pytest.raises(LaeError, match=r"clip\.mp4: no such file or folder"):
+        find_dataset(root=tmp_path / "clip.mp4", box=(1, 2, 3, 4))
+    with pytest.raises(LaeError, match="--box is of a video or images of yours: name them"):
+        find_dataset(box=(1, 2, 3, 4))
     truth(tmp_path / "only" / "annotations" / "a.txt", 3)
     with pytest.raises(LaeError, match=r"'a': no images found in .*only.* sequences/a, "):
         find_dataset(root=tmp_path / "only")

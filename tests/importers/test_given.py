@@ -66,7 +66,7 @@ def test_mean_fps_file(tmp_path):
     assert given.of("b", 99) == round(Fraction(10**13, 7441))
     with pytest.raises(LaeError, match="'a' has 2 frames there and 3 here"):
         given.of("a", 3)
-    with pytest.raises(LaeError, match="no row for sequence 'c'"):
+    with pytest.raises(LaeError, match=r"fps\.csv: no row for sequence 'c'"):
         given.of("c", 3)
     with pytest.raises(
         LaeError, match="has ECO, KCF, not 'SRDCF'; if it is there under another name"
@@ -77,6 +77,22 @@ def test_mean_fps_file(tmp_path):
         given_times(f"mean-fps:{path}", "any")
     write(path, "sequence,fps\na,25\n")
     assert given_times(f"mean-fps:{path}", "any").of("a", 7) == 40_000_000
+
+
+def test_mean_fps_of_trackers(tmp_path):
+    path = tmp_path / "fps.csv"
+    write(path, "tracker,fps\nKCF,250\nECO,25\n")
+    given = given_times(f"mean-fps:{path}", "ECO")
+    assert given.source == "mean fps of the tracker from fps.csv, not measured per frame"
+    assert (given.of("a", 2), given.of("b", 3)) == (40_000_000, 40_000_000)
+    with pytest.raises(LaeError, match=r"not 'SRDCF'.* add its rate or give --time mean-fps:120"):
+        given_times(f"mean-fps:{path}", "SRDCF")
+    write(path, "tracker,fps\nKCF,250\nKCF,25\n")
+    with pytest.raises(LaeError, match="line 3: a second row for 'KCF'"):
+        given_times(f"mean-fps:{path}", "KCF")
+    write(path, "tracker;fps\nKCF;250\n")
+    with pytest.raises(LaeError, match="tracker and fps, separated by commas"):
+        given_times(f"mean-fps:{path}", "KCF")
 
 
 @pytest.mark.parametrize(

@@ -204,5 +204,6 @@ def test_without_h5py_the_extra_is_named(
 ) -> None:
     path = write(**RUN)
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(LaeError, match=r"version 7\.3: install lae-sim\[mat73\] .*'-v7'\)"):
+    needs = r"version 7\.3: to read it pip install 'lae-sim\[mat73\]'.*'-v7'\)"
+    with pytest.raises(LaeError, match=needs):
         load_matlab(path)

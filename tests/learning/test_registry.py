@@ -149,7 +149,7 @@ def test_every_name_that_the_help_lists_is_there(tmp_path: Path) -> None:
         ("lae_sim.forecast.kalman:", "AttributeError"),
         (":Kalman", "ValueError"),
         ("lae_sim.forecast.kalman:RESTART_IOU", "not callable"),
-        ("lae_sim.forecast.kalman:Kalman:update", "AttributeError"),
+        ("lae_sim.forecast.kalman:Kalman.updat", "AttributeError"),
     ],
 )
 def test_a_wrong_name_says_what_is_wrong(name: str, problem: str) -> None:

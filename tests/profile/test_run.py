@@ -142,6 +142,40 @@ def test_a_profile_shows_its_progress_and_says_what_to_know(
     assert repr(again) == "<Profile: nothing was left to do>"
 
 
+def test_an_interruption_before_anything_is_complete_leaves_nothing(
+    tmp_path: Path, quick: dict[str, Any]
+) -> None:
+    def interrupt(done: int, total: int) -> None:
+        if done > LENGTH / 2:
+            raise KeyboardInterrupt
+
+    notices: list[str] = []
+    plan, out = ProfilePlan.of(**quick), tmp_path / "t.parquet"
+    with pytest.raises(KeyboardInterrupt):
+        run_profile(plan, out, progress=interrupt, notice=notices.append)
+    assert notices == ["no sequence is complete yet: nothing is kept"]
+    assert not list(tmp_path.iterdir())
+    assert len(run_profile(plan, out).traces) == 1
+
+
+def test_passes_that_fail_alike_say_so_once(
+    tmp_path: Path, quick: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "failing_tracker.py").write_text(
+        "class Failing:\n"
+        "    def init(self, frame, box): pass\n"
+        "    def track(self, frame): return False, (1, 2, 3, 4)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    notices: list[str] = []
+    settings = {**quick, "warmup": 2, "strides": [2, 3]}
+    plan = ProfilePlan.of(tracker="failing_tracker:Failing", **settings)
+    with pytest.raises(LaeError, match="no sequence could be profiled"):
+        run_profile(plan, tmp_path / "t.parquet", notice=notices.append)
+    [said] = [each for each in notices if each.startswith("failed: ")]
+    assert said.endswith("; of OpenCV's (found, box) answer the box, or None if it is not found")
+
+
 def test_images_that_change_size(tmp_path: Path) -> None:
     cv2 = pytest.importorskip("cv2", reason="frames are decoded with OpenCV")
     folder = tmp_path / "data" / "car"

@@ -108,4 +108,7 @@ def test_a_recipe_is_found_by_its_name(tmp_path: Path) -> None:
         find_recipe("made-up/kfc", recipes)
     with pytest.raises(LaeError, match="no recipe 47; lae-sim get lists those there are"):
         find_recipe(47, recipes)  # type: ignore[arg-type]
+    for dataset in ("made-up", "Made-Up/", "made-up/*"):
+        with pytest.raises(LaeError, match="is a dataset; name its trackers: made-up/kcf"):
+            find_recipe(dataset, recipes)
     assert find_recipe("dtb70/nanotrackv3").sequences == 70

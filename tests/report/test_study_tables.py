@@ -204,6 +204,25 @@ def test_pictures_over_sigma_are_called_mauc(over_grid, results):
         assert figure.axes[0].get_xlabel() == f"{name} won over hold"
 
 
+def test_the_front_names_each_tracker_beside_its_best_point(results):
+    view, [row, *_] = View(results), results.summary
+    held = [("MCCT", 116, 0.245), ("KCF", 4, 0.254), ("SiamAPN", 47, 0.36), ("UDT", 19, 0.381)]
+    best = [("MCCT", 116, 0.357), ("KCF", 4, 0.274), ("SiamAPN", 47, 0.452), ("UDT", 19, 0.411)]
+    points = [
+        Point(dataclasses.replace(row, trace=run, times_from=run), ms, auc)
+        for run, ms, auc in (*held, *best)
+    ]
+    view.__dict__["names"] = {run: run for run, _, _ in best}
+    [axes] = _front(view, points).axes
+    labels = {text.get_text(): text.xy for text in axes.texts}
+    assert labels == {run: (ms, auc) for run, ms, auc in best}
+
+
+def test_what_is_said_of_all_traces_is_said_once(results):
+    assert results._of_traces([("a", "x"), ("b", "y"), ("a", "x")]) == ["a: x", "b: y"]
+    assert results._of_traces([("a", "x"), ("b", "x")]) == ["all traces: x"]
+
+
 def test_files(results, tmp_path):
     write_tables(results, tmp_path / "new" / "tables")
     names = {"ranking", "table2", "attributes", "comparisons", "required"}

@@ -12,6 +12,7 @@ import pytest
 
 from lae_sim.files import csv_cell
 from lae_sim.report.table import (
+    COUNT,
     PERCENT,
     SCORE,
     SIGNED,
@@ -24,6 +25,7 @@ from lae_sim.report.table import (
     p_label,
     relative_change,
     text_of,
+    text_of_records,
     write_csv,
     write_parquet,
 )
@@ -131,3 +133,59 @@ def test_numbers() -> None:
     assert [p_label(0.0004), p_label(0.0126), p_label(None)] == ["<0.001", "0.013", "-"]
     assert relative_change(1.0, None) is None
     assert relative_change(1.0, 0.0) is None
+
+
+WIDE = (
+    Column("trace", "trace", is_label=True),
+    Column("forecaster", "forecaster", is_label=True),
+    Column("AUC", "auc", SCORE, importance=9),
+    Column("offline", "offline", SCORE, importance=4),
+    Column("frames", "frames", COUNT, importance=2),
+    Column("DP", "auc", SCORE, importance=8),
+)
+RUNS = [
+    {"trace": f"a-tracker-on-a-device-{n}.parquet", "forecaster": name, "auc": 0.5, "offline": 0.75,
+     "frames": 12345}
+    for n in (1, 2) for name in ("hold", "kalman")
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("width", "shown"),
+    [
+        (20, ["AUC"]),
+        (46, ["AUC"]),
+        (47, ["AUC", "DP"]),
+        (57, ["AUC", "DP"]),
+        (58, ["AUC", "frames", "DP"]),
+        (59, ["AUC", "offline", "DP"]),
+        (66, ["AUC", "offline", "DP"]),
+        (67, ["AUC", "offline", "frames", "DP"]),
+        (72, ["AUC", "offline", "frames", "DP"]),
+    ],
+)
+def test_a_table_fits_the_terminal_by_importance(width: int, shown: list[str]) -> None:
+    text = text_of_records(WIDE, RUNS, width)
+    table, _, said = text.partition("\nleft out for want of room: ")
+    header, _, *lines = table.splitlines()
+    assert header.split() == ["trace", "forecaster", *shown]
+    assert width < 40 or max(map(len, [header, *lines])) <= width
+    missing = [title for title in ("offline", "frames", "DP") if title not in shown]
+    told = ", ".join(missing) + "; --json has all of it" if missing else ""
+    assert said.replace("\n", " ") == told
+    assert len({line.split()[0] for line in lines}) == 2  # shorter names stay apart
+
+
+def test_a_table_that_is_not_for_a_terminal_is_whole() -> None:
+    assert text_of_records(WIDE, RUNS) == text_of_records(WIDE, RUNS, 1000)
+    assert text_of(Table.of(WIDE, RUNS)) == text_of_records(WIDE, RUNS)
+    assert "a-tracker-on-a-device-1.parquet" in text_of_records(WIDE, RUNS)
+
+
+def test_columns_of_one_title_are_told_apart_by_their_names() -> None:
+    both = [
+        Column("offline", "offline", SCORE, name=f"{of} offline", importance=n)
+        for n, of in enumerate(("AUC", "DP"))
+    ]
+    text = " ".join(text_of_records([*WIDE[:3], *both], RUNS, 59).split())
+    assert text.endswith("left out for want of room: AUC offline; --json has all of it")

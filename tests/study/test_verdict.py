@@ -269,6 +269,10 @@ def test_cliffs_and_what_comes_again() -> None:
     step = required(safe_auc=0.4084, next_auc=0.3997, safe_ms_per_frame=125.0)
     [line] = shortfalls([step], names)
     assert line.endswith("a cliff: 0.408 there, 0.400 one hundredth slower")
+    queued = dataclasses.replace(cliff, policy="fifo")
+    assert [line.partition(", AUC")[0] for line in shortfalls([cliff, queued], names)] == [
+        "kcf with hold, with policy latest", "kcf with hold, with policy fifo"
+    ]  # fmt: skip
 
 
 def test_however_much_there_is_little_is_said() -> None:
