@@ -320,12 +320,11 @@ def _run(
             for done, (batch, result) in enumerate(attempts, 1):
                 progress("", done, len(pieces))
                 computed += _keep(batch, result, store, failures)
-        progress("reading", len(pieces), len(pieces))
         scores = tuple(read_scores(plan, store))
         if not scores:
             raise LaeError(f"nothing could be computed: {failures[0].reason}")
         compared = _compare(scores, study.seed, store, run, failures, progress)
-    progress("summing up", 1, 1)
+    progress("summing up", len(pieces), len(pieces))
     answers = ((search, store.document(search.key)) for search in asked)
     results = StudyResults(
         folder=store.folder,
@@ -391,12 +390,16 @@ def _compare(
         few = sum(len(each.members) ** 2 for each in missing) < FEW
         with closing((run_here if few else run)(attempt, missing)) as attempts:
             early: dict[str, Pairs | None] = {}  # before their turn
+            done = 0
 
             def found(wanted: Rivals) -> Pairs | None:
                 """The pairs of some rivals, when their turn has come; None of what failed."""
+                nonlocal done
                 while wanted.key not in early:
                     each, result = next(attempts)
-                    progress("pairs", 0, 1)
+                    done += 1
+                    if not few:
+                        progress("pairs of traces", done, len(missing))
                     is_failure = isinstance(result, Failure)
                     failures.extend([result] if is_failure else [])
                     early[each.key] = None if is_failure else result
