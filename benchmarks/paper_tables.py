@@ -206,7 +206,7 @@ def with_boxes(data: Path) -> Iterator[tuple[Published, Trace]]:
 
 def offline(trace: Trace) -> Floats:
     """AUC and DP of the boxes at their own frames, float64 [2]."""
-    runs = World.of(search="off").replay(trace, batch=True)
+    runs = World.of(search="off").replay(trace)
     scores = evaluate_runs(runs, trace.metadata, {"hold": load_forecaster("hold")}).offline
     return np.array([scores["auc"].mean(), scores["dp20"].mean()])
 
@@ -244,7 +244,7 @@ def replayed(
             keep_size=pre is not None,
         )
         runs, weights = [], []
-        for run in replace(world.replay(trace, batch=True), search=model):
+        for run in replace(world.replay(trace), search=model):
             if run.modelled is None:  # it processed every frame
                 runs.append(run)
                 weights.append(np.ones(len(reaches)))

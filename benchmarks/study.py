@@ -31,6 +31,7 @@ from lae_sim.evaluation import evaluate_groups
 from lae_sim.forecast import Hold
 from lae_sim.replay import Runs, bootstrap, replay_repeated
 from lae_sim.report.table import aligned
+from lae_sim.study.pairs import Member, pairs_of
 
 RATES = (15, 20, 25, 30, 40, 50, 60, 90)  # frames/s of the trackers
 REPETITIONS = 81  # 9,963 lanes
@@ -137,9 +138,11 @@ def study(
 
 def whole_lines(folder: Path, rounds: int) -> list[list[str]]:
     """Eight traces, 51 sigmas: the floor, hold, and hold and kalman."""
-    targets = {"hold": "<= 1.5", "hold + kalman": "<= 4"}
     found = []
-    for kind, jitter in (("constant times", 0.0), ("times jitter by 10 %", 0.1)):
+    for kind, jitter, *targets in (
+        ("constant times", 0.0, "", "<= 4", "<= 6"),
+        ("times jitter by 10 %", 0.1, "", "<= 5", "<= 8"),
+    ):
         traces = [
             write_tracker(folder / f"{kind[0]}{rate}.parquet", rate, jitter) for rate in RATES
         ]
@@ -158,8 +161,8 @@ def whole_lines(folder: Path, rounds: int) -> list[list[str]]:
         found += [
             [f"8 traces, 51 sigmas, {kind}", name, f"{cost.wall:.2f} s", f"{cost.cpu:.2f} s"]
             + [f"{cost.worker:.0f}, {cost.parent:.0f}", f"{cost.wall / floor:.1f} x floor"]
-            + [targets.get(name, "")]
-            for name, cost in taken.items()
+            + [target]
+            for (name, cost), target in zip(taken.items(), targets)
         ]
     return found
 
@@ -197,6 +200,64 @@ def size_lines(folder: Path, rounds: int, largest: int) -> list[list[str]]:
             + [f"{cost.cpu:.2f} s", f"{cost.worker:.0f}, {cost.parent:.0f}", ratios, "flat"]
         ]
         os.unlink(trace)
+    return found
+
+
+def write_small(folder: Path, trackers: int, datasets: int = 20) -> None:
+    """Write a trace of each tracker on each dataset: 8 sequences of 60 frames."""
+    folder.mkdir()
+    for tracker in range(trackers):
+        for number in range(datasets):
+            truths, rng = np.random.default_rng(number), np.random.default_rng([number, tracker])
+            ns = 1e6 * rng.uniform(25, 85)
+            recordings = []
+            for name in "abcdefgh":
+                truth = np.full((60, 4), 60.0)
+                truth[:, :2] = 400 + truths.normal(0, 6, (60, 2)).cumsum(0)
+                boxes = truth + rng.normal(0, 3, truth.shape)
+                times = (ns * rng.lognormal(0, 0.1, 60)).astype(np.int64)
+                recordings.append(Recording.new(name, truth, boxes, times))
+            metadata = Metadata.new(
+                "30",
+                "every-frame",
+                tracker={"name": f"tracker-{tracker}"},
+                dataset={"name": f"dataset-{number}"},
+            )
+            path = folder / f"{tracker}-{number}.parquet"
+            write_trace(Trace(metadata, recordings), path)
+
+
+def many_lines(folder: Path, traces: int) -> list[list[str]]:
+    """A study of many small traces of 20 datasets, all pairs and the report, and once more."""
+    write_small(folder / "small", traces // 20)
+    file, out = folder / "small.toml", folder / "small-results"
+    file.write_text(f'traces = ["{folder}/small/*.parquet"]\n', encoding="utf-8")
+    first, again = (
+        process("-m", "lae_sim", "study", str(file), "--out", str(out)) for _ in range(2)
+    )
+    files = sum(path.is_file() for path in out.rglob("*"))
+    report = (out / "report.html").stat().st_size / 1e6
+    targets = ("<= 8 s", "<= 2 s") if traces == 1000 else ("<= 600 s, < 500 MiB, < 5 MB", "")
+    return [
+        [f"{traces:,} traces of 8 x 60 frames, 20 datasets", name, f"{cost.wall:.2f} s"]
+        + [f"{cost.cpu:.2f} s", f"{cost.worker:.0f}, {cost.parent:.0f}"]
+        + [f"{files} files, report {report:.1f} MB", target]
+        for name, cost, target in zip(("all", "nothing to do"), (first, again), targets)
+    ]
+
+
+def pair_lines(rounds: int) -> list[list[str]]:
+    """Pairs of 100 traces of 123 sequences: one by one, and as studies compare them."""
+    rng = np.random.default_rng(0)
+    found = []
+    for repetitions, target in ((1, "<= 0.2"), (100, "<= 0.2")):
+        names = tuple(f"{s:03}" for s in range(123))
+        members = [Member(names, rng.random((repetitions, 123))) for _ in range(100)]
+        taken = medians({"": lambda members=members: pairs_of(members)}, rounds)[""]
+        found.append(
+            [f"4,950 pairs, 123 sequences, {repetitions} repetitions", "one process"]
+            + [f"{taken / 4950 * 1e3:.3f} ms each", "", "", "", target]
+        )
     return found
 
 
@@ -268,12 +329,17 @@ def main() -> None:
     parser.add_argument(
         "--largest", type=int, default=10, help="times UAV123, for the memory: 1, 10 or 100"
     )
+    parser.add_argument(
+        "--traces", type=int, default=1000, help="small traces of a study: 1000 or 10000"
+    )
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         found = whole_lines(folder, arguments.rounds)
         found += worker_lines(folder, arguments.rounds)
         found += size_lines(folder, arguments.rounds, arguments.largest)
+        found += many_lines(folder, arguments.traces)
+    found += pair_lines(arguments.rounds)
     found += lane_lines(arguments.rounds)
     head = ["what", "how", "median", "all cores", "MiB: worker, parent", "ratio", "target"]
     print(aligned(head, found))

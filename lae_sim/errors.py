@@ -95,7 +95,7 @@ def visible(text: object, keep: str = "") -> str:
         car\x1b[2J\u202e
     """
     text = str(text)
-    if text.isprintable():
+    if text.translate(dict.fromkeys(map(ord, keep))).isprintable():
         return text
     return "".join(
         c if c.isprintable() or c in keep else c.encode("unicode_escape").decode() for c in text

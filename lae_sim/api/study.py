@@ -8,18 +8,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from lae_sim import __version__
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
 from lae_sim.figures.study import study_in_columns
+from lae_sim.files import text_digest
 from lae_sim.plugins import looking_in
 from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.world import named
 from lae_sim.report.page import write_report
-from lae_sim.report.paper import Paper, remove_paper, write_paper
+from lae_sim.report.paper import Paper, remove_paper, write_paper, written_before
 from lae_sim.report.study_tables import paper_tables
 from lae_sim.study.run import StudyResults, check_inputs, compute_study
 from lae_sim.study.spec import Study, read_study
+from lae_sim.study.store import Store
 from lae_sim.study.view import View
+from lae_sim.trace.locate import digest
+
+VIEWS = "views"
+"""The document that says what the views of a study were made of."""
 
 
 def run_study(
@@ -112,13 +119,41 @@ def _asked_for(
 def write_views(
     results: StudyResults, report: bool = True, root: str | os.PathLike[str] | None = None
 ) -> None:
-    """Write the report and what a paper needs beside a study's results, or take old ones away."""
+    """Write the report and what a paper needs beside a study's results, or take old ones away.
+
+    What was written of the same results, and is as it was written, is not written again; but with
+    frames, which may have changed.
+    """
     page = results.folder / "report.html"
     if report:
+        if root is None and _are_there(results):
+            return
         view = View(results)
         frames = {"scores": view.results.scores_frame()}
         write_paper(Paper(study_in_columns(view), paper_tables(view), frames), results.folder)
         write_report(view, page, root)
+        if root is None:
+            Store(results.folder).keep(VIEWS, _views(results))
         return
     remove_paper(results.folder)  # it would be of other results
     page.unlink(missing_ok=True)
+
+
+def _are_there(results: StudyResults) -> bool:
+    """Whether the views of these results are there, as they were written."""
+    kept = Store(results.folder).document(VIEWS)
+    try:
+        return kept is not None and kept == _views(results)
+    except LaeError:  # a file is not there
+        return False
+
+
+def _views(results: StudyResults) -> dict[str, Any]:
+    """What the views are made of, and digests of their files."""
+    made_of = [__version__, digest(str(results.folder / "study.json"))]
+    made_of += [cell.key for cell in results.plan.cells]
+    files = [results.folder / "report.html", *sorted(written_before(results.folder))]
+    return {
+        "of": text_digest(" ".join(made_of)),
+        "files": {path.relative_to(results.folder).as_posix(): digest(str(path)) for path in files},
+    }

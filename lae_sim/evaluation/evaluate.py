@@ -22,12 +22,15 @@ from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, f
 from lae_sim.replay.run import Run
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes, Metadata
-from lae_sim.trace.recording import BATCH_ROWS, Recording, batched
+from lae_sim.trace.recording import BESIDE, Recording, batched
 
 Record = TypeVar("Record", "Staleness", "Curves")
 
 PairedBoxes: TypeAlias = "tuple[Histories, Pairs, Floats]"
 """Histories, their pairs with frames, and the box of each pair, float64 [P, 4]."""
+
+GROUP_FRAMES = 1 << 16
+"""World frames that are scored at once, unless more memory than a small process has is there."""
 
 _PART = 1 << 19  # outputs that forecasters are fed at once
 
@@ -269,7 +272,7 @@ def evaluate_groups(
     sigmas: Sequence[Fraction] = (Fraction(0),),
     convention: Convention = PYSOT,
     costs: Mapping[str, int] | None = None,
-    frames: int = BATCH_ROWS,
+    frames: int = GROUP_FRAMES,
     curves_at: Fraction | None = None,
     observers: Sequence[Observer] = (),
     observed: Collection[tuple[str, Fraction]] = (),
@@ -300,7 +303,7 @@ def evaluate_groups(
         observed,
     )
     offline: dict[Recording, _Offline] = {}
-    for group in batched(runs, frames):
+    for group in batched(runs, frames, BESIDE):
         offline = _offline([run.recording for run in group], convention, offline)
         yield scoring.of(group, [offline[run.recording] for run in group])
     if not offline:
@@ -433,7 +436,7 @@ class _Scoring:
                     others.append((s, r, replace(run, boxes=each)))
         costs = {self.costs.get(name, 0) for name in self.forecasters}
         unobserved, places = replace(self, observed=()), iter(others)
-        for group in batched([run for *_, run in others]):
+        for group in batched([run for *_, run in others], GROUP_FRAMES, BESIDE):
             schedules = [run.schedule for run in group]
             pairings = {cost: pair(schedules, self.sigmas, cost) for cost in costs}
             scored = unobserved._scored(group, pairings, [])

@@ -96,17 +96,17 @@ class Pairing:
             self.clocks[sequence : sequence + 1],
         )
 
-    @property
+    @cached_property
     def mismatch_sum(self) -> Ints:
         """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""
         return (self.lengths * (self.lengths - 1) // 2)[:, None] - self._gaps.source_sum
 
-    @property
+    @cached_property
     def mismatch_max(self) -> Ints:
         """Largest i - psi(i) of each sequence, frames, int64 [S, M]."""
         return self._gaps.mismatch
 
-    @property
+    @cached_property
     def longest_hold(self) -> Ints:
         """Most queries in a row that one output answered, frames, int64 [S, M]."""
         return self._gaps.hold

@@ -51,8 +51,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-MOST_CURVES, MOST_PAIRS, MOST_BARS, MOST_HISTOGRAMS = 8, 6, 30, 30
-"""What one picture holds of curves, rows and histograms, and how many curve pictures there are."""
+MOST_CURVES, MOST_PAIRS, MOST_BARS, MOST_HISTOGRAMS, MOST_POINTS = 8, 6, 30, 30, 40
+"""What one picture holds of curves, rows and histograms, how many pictures of curves and panels of
+datasets there are, and how many points a panel has beside those of the front."""
 
 
 @dataclass(frozen=True)
@@ -238,15 +239,30 @@ def front(view: View) -> Picture | None:
     points = _points(view)
     if not points:
         return None
-    return Picture(_front_caption(points), svg_of(_front(view, points)))
+    left_out = _left_out(view, points)
+    return Picture(f"{_front_caption(points)}{left_out}", svg_of(_front(view, points)))
+
+
+def _left_out(view: View, points: Sequence[Point]) -> str:
+    """What of a study is not drawn as points, in words."""
+    datasets, drawn = ({row.dataset for row in some} for some in
+                       (view.standing, [point.row for point in points]))  # fmt: skip
+    said = f"; the first {len(drawn)} of {len(datasets)} datasets" if drawn < datasets else ""
+    within = sum(row.dataset in drawn for row in view.standing)
+    return said + (f"; the best of {within:,}, and the fronts" if len(points) < within else "")
 
 
 def _points(view: View) -> list[Point]:
-    return [
-        Point(row, row.elapsed_ms, auc)
-        for row in view.standing
-        if row.elapsed_ms is not None and (auc := row.score("auc")) is not None
-    ]
+    """Those of the first datasets: all of the front, and the best of the others."""
+    datasets: dict[str, list[Point]] = {}
+    for row in view.standing:
+        if row.elapsed_ms is not None and (auc := row.score("auc")) is not None:
+            datasets.setdefault(row.dataset, []).append(Point(row, row.elapsed_ms, auc))
+    chosen: list[Point] = []
+    for points in [*datasets.values()][:MOST_PAIRS]:
+        least = sorted((point.auc for point in points), reverse=True)[:MOST_POINTS][-1]
+        chosen += [point for point in points if point.row.pareto or point.auc >= least]
+    return chosen
 
 
 def _front_caption(points: Sequence[Point]) -> str:
@@ -300,8 +316,7 @@ def _draw_front(axes: Axes, view: View, points: Sequence[Point]) -> None:
 
 def _name_trackers(axes: Axes, view: View, points: Sequence[Point]) -> None:
     """A label beside each tracker's best point; where there is no room, above and joined to it."""
-    ordered = sorted(points, key=lambda point: point.auc)
-    best = {run_of(point.row): point for point in ordered}
+    best = {run_of(point.row): point for point in sorted(points, key=lambda point: point.auc)}
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     inches = axes.bbox.width / axes.figure.dpi
     letter, line = 0.055 * (right - left) / inches, 0.055 * (high - low)
@@ -477,7 +492,7 @@ def _histograms(traces: Sequence[Mapping[str, Any]]) -> Figure:
 
 def study_in_columns(view: View) -> Iterator[ColumnFigure]:
     """The figures of a study for a paper, at the settings that stand for all."""
-    for scores, left_out in _curve_groups(view):
+    for scores, left_out in _curve_groups(view)[:MOST_PAIRS]:
         rows = [view.row_of(each) for each in scores]
         if not any(map(view.stands, rows)):
             break
@@ -514,7 +529,8 @@ def study_in_columns(view: View) -> Iterator[ColumnFigure]:
         yield ColumnFigure("recovered", f"Share of the loss won back. {caption}", share)
     for dataset, group in _attribute_rows(view):
         yield from attributes_in_columns(group, "auc", dataset)
-    for trace in view.results.traces:
+    several = view.results.traces[: MOST_HISTOGRAMS + 1]
+    for trace in several if len(several) <= MOST_HISTOGRAMS else ():
         if trace["times"]["histogram"]:
             yield ColumnFigure(
                 f"times-{trace['trace']}",

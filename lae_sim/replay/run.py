@@ -13,7 +13,7 @@ from lae_sim._arrays import Floats, Ints
 from lae_sim.boxes import PARTED_IOU, iou
 from lae_sim.engine.arrivals import same_arrivals, with_arrivals
 from lae_sim.engine.clock import Clock
-from lae_sim.engine.lanes import simulate_lanes
+from lae_sim.engine.lanes import batchable, simulate_lanes
 from lae_sim.engine.policies import latest
 from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
 from lae_sim.engine.times import Times
@@ -24,9 +24,9 @@ from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes
-from lae_sim.trace.recording import Recording, batched
+from lae_sim.trace.recording import BESIDE, Recording, batched
 
-_GROUP_FRAMES = 1 << 17  # world frames of the sequences that are in memory at once
+_GROUP_FRAMES = 1 << 16  # world frames of the sequences that are in memory at once
 _LEAST = 0.2  # weight of the farther of two strides beside a step
 _LANE_FRAMES = 1 << 21  # and of their repetitions
 
@@ -258,8 +258,6 @@ class Runs:
         timing: another device's trace to take the times from; it must have the same sequences.
         passes: further traces of the same tracker: at other strides (see
             :func:`replay_sequence`), and gap passes.
-        batch: schedule many sequences at once where source and policy allow it (see
-            :func:`lae_sim.engine.lanes.batchable`). The runs are the same, and come in groups.
         search: the model of where the tracker finds its target; None for none.
         forget_arrivals: let all frames arrive evenly, whatever the traces say of it.
 
@@ -284,7 +282,6 @@ class Runs:
     policy: Policy = latest
     timing: Trace | None = None
     passes: tuple[Trace, ...] = ()
-    batch: bool = False
     search: SearchModel | None = None
     forget_arrivals: bool = False
 
@@ -336,11 +333,29 @@ class Runs:
         return self.trace if self.timing is None else self.timing
 
     def __iter__(self) -> Iterator[Run]:
-        frames = _GROUP_FRAMES if self.batch else 1
-        for jobs in batched(self._jobs(), frames):
-            with explained("latency"):
-                services = [self.source(job.times) for job in jobs]
+        for jobs, services in self._groups():
             yield from _replayed(jobs, services, self.policy)
+
+    def _groups(self) -> Iterator[tuple[list[_Job], list[Service]]]:
+        """Jobs with their services, as many as can be scheduled at once and be in memory.
+
+        A user's own policy or source sees one sequence after another: each is replayed before the
+        source is asked for the next.
+        """
+        jobs: list[_Job] = []
+        services: list[Service] = []
+        pending = 0
+        for job in self._jobs():
+            with explained("latency"):
+                service = self.source(job.times)
+            jobs.append(job)
+            services.append(service)
+            pending += len(job) + BESIDE
+            if pending >= _GROUP_FRAMES or not batchable([service], self.policy):
+                yield jobs, services
+                jobs, services, pending = [], [], 0
+        if jobs:
+            yield jobs, services
 
     def _jobs(self) -> Iterator[_Job]:
         """Each recording of the trace with those of the same name in the other traces."""
@@ -403,7 +418,7 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
     source = runs.source
     if not isinstance(source, RandomSource):
         raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
-    for jobs in batched(runs._jobs(), _GROUP_FRAMES):
+    for jobs in batched(runs._jobs(), _GROUP_FRAMES, BESIDE):
         size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
         for begin in range(first, first + count, size):
             some = range(begin, min(begin + size, first + count))

@@ -296,7 +296,6 @@ class World:
         self,
         trace: TraceLike,
         sequences: str | Iterable[str] | None = None,
-        batch: bool = False,
         pre_forecaster: AnyFactory | None = None,
     ) -> Runs:
         """Replay a trace in this world.
@@ -304,8 +303,6 @@ class World:
         Args:
             trace: the boxes and the truth.
             sequences: those wanted; all by default.
-            batch: schedule many sequences at once where policy and latency allow it (see
-                :func:`lae_sim.engine.lanes.batchable`). The runs are the same.
             pre_forecaster: what the world's name of one stands for (see
                 :func:`lae_sim.learning.registry.load_forecaster`).
 
@@ -328,7 +325,6 @@ class World:
             self.rule(),
             None if self.timing is None else open_trace(self.timing),
             (*(each if names is None else each.chosen(names) for each in strided), *gaps),
-            batch,
             find_search(self.search, opened.metadata, gaps, pre_forecaster, self.keep_size),
             self.forget_arrivals,
         )
@@ -344,7 +340,6 @@ def replay_trace(
     timing: TraceLike | None = None,
     passes: TraceLike | Iterable[TraceLike] = (),
     search: str = "trace",
-    batch: bool = False,
     forget_arrivals: bool = False,
 ) -> Runs:
     """Replay every sequence of a trace, one after another.
@@ -352,7 +347,6 @@ def replay_trace(
     Args:
         trace: the boxes and the truth: an open trace, or the path or URL of one.
         fps, policy, latency, scale, timing, passes, search, forget_arrivals: see :meth:`World.of`.
-        batch: see :meth:`World.replay`.
 
     Returns:
         The runs, which are made while one goes through them, and may be gone through again.
@@ -377,7 +371,7 @@ def replay_trace(
         forget_arrivals=forget_arrivals,
         **open_others(timing, passes),
     )
-    return world.replay(opened, batch=batch)
+    return world.replay(opened)
 
 
 def open_trace(trace: TraceLike, sequences: Iterable[str] | None = None) -> Trace:

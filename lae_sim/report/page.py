@@ -25,6 +25,7 @@ from lae_sim.files import written_whole
 from lae_sim.report import study_tables
 from lae_sim.report.closeup import CloseUp, close_ups
 from lae_sim.report.inline import dark_colours, inlined, variable
+from lae_sim.report.study_tables import MOST_LINES, MOST_ROWS, some_of
 from lae_sim.report.table import COUNT, PERCENT, Column, Number, Table
 from lae_sim.study.verdict import shortfalls
 from lae_sim.study.view import View
@@ -207,8 +208,8 @@ def _search_facts(results: StudyResults) -> dict[str, str]:
 def _sections(view: View, root: str | os.PathLike[str] | None) -> Iterator[Section]:
     results = view.results
     failures = [f"{failure.of}: {failure.reason}" for failure in results.failures]
-    yield Section("failures", "Failures", texts=failures)
-    ranking = study_tables.ranking(view)
+    yield Section("failures", "Failures", texts=some_of(failures, "study.json"))
+    ranking = study_tables.ranking(view, most=MOST_ROWS)
     meanings = {column.title: column.meaning for column in ranking.columns if column.meaning}
     yield Section("ranking", "Ranking", meanings=meanings, table=ranking)
     yield Section("table2", "With and without forecasters", table=study_tables.table2(view))
@@ -222,25 +223,38 @@ def _sections(view: View, root: str | os.PathLike[str] | None) -> Iterator[Secti
     yield Section("sequences", "Frame by frame", texts=texts, close_ups=sequences)
     if attributes := study_tables.attribute_table(view):
         pictures = [*study_figures.attributes(view)]
-        yield Section("attributes", "Attributes", pictures=pictures, table=attributes)
+        yield Section(
+            "attributes",
+            "Attributes",
+            pictures=pictures,
+            table=attributes.first(MOST_ROWS, "tables/attributes.csv"),
+        )
     if results.comparisons:
         compared = study_tables.comparison_table(view)
         yield Section("comparisons", "Trackers against each other", table=compared)
     if results.required:
-        required = study_tables.required_table(view)
+        required = study_tables.required_table(view).first(MOST_ROWS, "required.csv")
         texts = shortfalls(results.required, view.names)
         yield Section("required", "What the required AUC asks for", texts=texts, table=required)
     histograms = _drawn(study_figures.histograms(view))
-    yield Section("times", "Processing times", pictures=histograms, table=_times(results))
+    yield Section(
+        "times",
+        "Processing times",
+        pictures=histograms,
+        table=_times(results).first(MOST_ROWS, "study.json"),
+    )
     digests = {source.input.label: source.input.digest for source in results.plan.sources}
     traces = [
-        _provenance(trace, digests.get(trace["trace"], "unknown")) for trace in results.traces
+        _provenance(trace, digests.get(trace["trace"], "unknown"))
+        for trace in results.traces[:MOST_LINES]
     ]
-    yield Section("traces", "Traces", entries=traces)
+    left = len(results.traces) - len(traces)
+    texts = [f"the first {len(traces)}; {left:,} more are in study.json"] if left else []
+    yield Section("traces", "Traces", texts=texts, entries=traces)
     used = dict.fromkeys(row.convention for row in results.summary)
     conventions = {name: convention_in_words(CONVENTIONS[name]) for name in used}
     yield Section("conventions", "Conventions", facts=conventions)
-    yield Section("notes", "Notes", texts=results.notes())
+    yield Section("notes", "Notes", texts=some_of(results.notes(), "study.json"))
     asked = Entry("What was asked for", _json(results.plan.study.document()))
     yield Section("study", "The study", entries=[asked])
 

@@ -58,7 +58,13 @@ if TYPE_CHECKING:
 Row = Mapping[str, Any]
 
 MOST_PAIRS = 300
-"""Comparisons that are shown, at most, before only those of settings that stand for all are."""
+"""Comparisons that are shown, at most, before only those of settings that stand for all are; and of
+these, the nearest to the best of each setting."""
+
+MOST_ROWS, MOST_TRACKERS, MOST_LINES = 400, 40, 60
+"""Rows of a ranking, trackers of a table of them, and lines of a list that are shown, at most.
+
+Files of numbers have them all."""
 
 
 def _names(keys: Iterable[str]) -> list[Column]:
@@ -147,7 +153,10 @@ _INTERVALS = ("AUC", "mAUC", "modelled", "jitter", "AUC of a - b", "mAUC of a - 
 
 
 def ranking(
-    view: View, titles: Container[str] | None = None, standing_alone: bool = False
+    view: View,
+    titles: Container[str] | None = None,
+    standing_alone: bool = False,
+    most: int | None = None,
 ) -> Table:
     """A row per trace, setting and forecaster, the best AUC of a setting first.
 
@@ -155,6 +164,7 @@ def ranking(
         view: of a study.
         titles: of the columns beside names and settings; by default all.
         standing_alone: whether there are only rows of the settings that stand for all.
+        most: rows that are shown, about: as many of each setting; by default all.
     """
     settings = several(view.rows)
     places = [(row.dataset, *(getattr(row, key) for key in settings)) for row in view.rows]
@@ -162,7 +172,8 @@ def ranking(
     best_first = sorted(
         zip(places, view.rows), key=lambda pair: (order[pair[0]], -(pair[1].score("auc") or 0))
     )
-    shown = [row for _, row in best_first if view.stands(row) or not standing_alone]
+    chosen = [pair for pair in best_first if view.stands(pair[1]) or not standing_alone]
+    shown, left_out_rows = _best_of_each(chosen, most)
     rows = [{**_as_ranked(row), "tracker": view.names[run_of(row)]} for row in shown]
     left_out = set() if any("auc_jitter_low" in row for row in rows) else {"jitter"}
     if not any(row.modelled for row in shown):
@@ -177,7 +188,21 @@ def ranking(
     first = f"The best {score_name('AUC', shown)}"
     first += " first" if standing_alone else " of each setting first"
     table = Table.of(columns, rows, "ranking", f"{first}: {shared_setting(shown)}")
-    return replace(table, note="; ".join(view.results.ranked_by()))
+    return replace(table, note="; ".join([*left_out_rows, *view.results.ranked_by()]))
+
+
+def _best_of_each(
+    rows: Sequence[tuple[object, SummaryRow]], most: int | None
+) -> tuple[list[SummaryRow], list[str]]:
+    """As many rows of each place, and what to say of the others."""
+    together: dict[object, list[SummaryRow]] = {}
+    for place, row in rows:
+        together.setdefault(place, []).append(row)
+    if most is None or len(rows) <= most:
+        return [row for _, row in rows], []
+    each = max(1, most // len(together))
+    some = [row for group in together.values() for row in group[:each]][:most]
+    return some, [f"the best {each} of each setting: all {len(rows):,} rows are in summary.csv"]
 
 
 def _named(column: Column, rows: Sequence[SummaryRow]) -> Column:
@@ -207,8 +232,17 @@ def _as_ranked(row: SummaryRow) -> dict[str, Any]:
 
 
 def table2(view: View) -> Table:
-    """Trackers with and without forecasters (see :func:`.paper.with_and_without`)."""
+    """Trackers with and without forecasters (see :func:`.paper.with_and_without`); the best ones.
+
+    The best have the highest mean AUC over the datasets that they were run on.
+    """
     rows = view.standing
+    aucs: dict[str, list[float]] = {}
+    for row in rows:
+        aucs.setdefault(view.names[run_of(row)], []).append(row.score("auc") or 0.0)
+    best = sorted(aucs, key=lambda name: -sum(aucs[name]) / len(aucs[name]))[:MOST_TRACKERS]
+    kept = {*best}
+    rows = [row for row in rows if view.names[run_of(row)] in kept]
     titles = {"auc": score_name("AUC", rows), "dp20": score_name("DP", rows)}
     scores = [
         TrackerScores(
@@ -220,7 +254,9 @@ def table2(view: View) -> Table:
         )
         for row in rows
     ]
-    return with_and_without(scores, view.forecasters, titles, shared_setting(rows))
+    table = with_and_without(scores, view.forecasters, titles, shared_setting(rows))
+    note = f"The best {len(kept)} of {len(aucs):,} trackers; all are in summary.csv."
+    return replace(table, note=note) if len(kept) < len(aucs) else table
 
 
 def attribute_table(view: View, pooled: bool = False) -> Table | None:
@@ -264,10 +300,12 @@ def attribute_table(view: View, pooled: bool = False) -> Table | None:
 def comparison_table(view: View) -> Table:
     """A row per pair of traces; where there are many, of settings that stand for all."""
     rows, left_out = list(view.results.comparisons), ""
-    if len(rows) > MOST_PAIRS:
+    if view.results.pairs > MOST_PAIRS:
         rows = [row for row in rows if view.chosen[row.a] == setting_of(row)]
-        left_out = f"; {len(view.results.comparisons):,} pairs of all settings are in "
-        left_out += "comparisons.csv"
+        if len(rows) > MOST_PAIRS:
+            rows = _nearest_to_the_best(rows)
+            left_out = "; those nearest to the best of each setting"
+        left_out += f"; {view.results.pairs:,} pairs of all settings are in comparisons.parquet"
     columns = [
         *_names([*_differing(rows, ("dataset", *SETTINGS)), "forecaster", "a", "b"]),
         Column("n", "sequences", _COUNT),
@@ -290,6 +328,29 @@ def comparison_table(view: View) -> Table:
         "number of pairs of a setting."
     )
     return replace(table, note=note)
+
+
+def _nearest_to_the_best(rows: Sequence[Comparison]) -> list[Comparison]:
+    """As many pairs of each setting and forecaster, those with its best trace, nearest first."""
+    together: dict[tuple[object, ...], list[Comparison]] = {}
+    for row in rows:
+        place = row.dataset, *setting_of(row), row.forecaster
+        together.setdefault(place, []).append(row)
+    each = max(1, MOST_PAIRS // len(together))
+    found: list[Comparison] = []
+    for group in together.values():
+        worse = {row.b if row.difference.value > 0 else row.a for row in group}
+        best = {name for row in group for name in (row.a, row.b)} - worse
+        with_best = [row for row in group if row.a in best or row.b in best]
+        found += sorted(with_best, key=lambda row: abs(row.difference.value))[:each]
+    return found[:MOST_PAIRS]
+
+
+def some_of(lines: Sequence[str], where: str, most: int = MOST_LINES) -> list[str]:
+    """The first lines of a list; where there are more, the last says how many, and where."""
+    if len(lines) <= most:
+        return list(lines)
+    return [*lines[: most - 1], f"and {len(lines) - most + 1:,} more, in {where}"]
 
 
 def required_table(view: View) -> Table:
@@ -352,8 +413,8 @@ def paper_tables(view: View) -> list[PaperTable]:
     tables = [
         PaperTable(
             ranking(view),
-            ranking(view, _PAPER, standing_alone=True),
-            ranking(view, _COLUMN, standing_alone=True),
+            ranking(view, _PAPER, standing_alone=True, most=MOST_ROWS),
+            ranking(view, _COLUMN, standing_alone=True, most=MOST_ROWS),
         ),
         in_two_forms(table2(view)),
     ]
@@ -366,7 +427,7 @@ def paper_tables(view: View) -> list[PaperTable]:
         short = compared.only(lambda _, column: not column.title.startswith("a better"))
         tables.append(PaperTable(compared, compared, short))
     if view.results.required:
-        required = required_table(view)
+        required = required_table(view).first(MOST_ROWS, "required.csv")
         short = required.only(lambda _, column: column.is_label or column.key in _REQUIRED)
         tables.append(PaperTable(required, required, short))
     return tables
@@ -412,12 +473,12 @@ def study_text(results: StudyResults | View, width: int | None = None) -> str:
         width: as of :func:`lae_sim.report.table.text_of`.
     """
     view = results if isinstance(results, View) else View(results)
-    results, tables = view.results, [ranking(view, _TERMINAL)]
+    results, tables = view.results, [ranking(view, _TERMINAL, most=MOST_ROWS)]
     repeated = any(row.repetitions > 1 for row in view.rows)
     if results.comparisons and (repeated or len(results.comparisons) <= 30):
         tables.append(comparison_table(view))
     if results.required:
-        tables.append(required_table(view))
+        tables.append(required_table(view).first(MOST_ROWS, "required.csv"))
     parts = ["\n".join(filled(line) for line in results.verdict())]
     for table in tables:
         text = text_of(table, intervals=_INTERVALS, width=width)
@@ -431,5 +492,6 @@ def study_text(results: StudyResults | View, width: int | None = None) -> str:
             f"approximate: up to {100 * max(approximate):.3g}% of the outputs of a replay follow "
             "another frame than when recorded"
         )
-    lines += [f"not computed: {each.of}: {each.reason}" for each in results.failures]
-    return "\n\n".join([*filter(None, parts), "\n".join([*lines, *results.notes()])])
+    failed = [f"not computed: {each.of}: {each.reason}" for each in results.failures]
+    lines += [*some_of(failed, "study.json"), *some_of(results.notes(), "study.json")]
+    return "\n\n".join([*filter(None, parts), "\n".join(lines)])

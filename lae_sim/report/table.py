@@ -188,6 +188,18 @@ class Table:
         rows = tuple(tuple(row[place] for place in kept) for row in self.rows)
         return replace(self, columns=tuple(self.columns[place] for place in kept), rows=rows)
 
+    def first(self, most: int, rest: str) -> Table:
+        """The table of the first rows; where there are more, its note says how many, and where.
+
+        Args:
+            most: rows that are kept.
+            rest: where all of them are.
+        """
+        if len(self.rows) <= most:
+            return self
+        said = f"The first {most:,} of {len(self.rows):,} rows; all are in {rest}."
+        return replace(self, rows=self.rows[:most], note=f"{self.note} {said}".lstrip())
+
     @property
     def minor(self) -> set[int]:
         """The places of columns that need not be seen: unimportant, or of one label alone."""

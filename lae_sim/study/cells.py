@@ -31,7 +31,7 @@ from lae_sim.replay.latency import RandomSource
 from lae_sim.replay.run import Run, replay_repeated
 from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import World, kind_of, label_of
-from lae_sim.study.rows import CellRows
+from lae_sim.study.rows import CellRows, RowsFile
 from lae_sim.study.spec import is_random
 from lae_sim.trace.file import Trace, held, read_trace
 from lae_sim.trace.metadata import Metadata
@@ -211,40 +211,58 @@ class Result:
 
     Attributes:
         key: the cell's.
-        rows: a Parquet file (see :mod:`lae_sim.study.rows`).
+        rows: a Parquet file (see :mod:`lae_sim.study.rows`); empty where cells share one.
+        first, count: the first of the cell's rows in its file, and how many they are.
         about: curves at the first sigma, how many outputs are approximate, the engine, where times
             of initialisations are from, notes, what is modelled (see :func:`_modelled`).
     """
 
     key: str
     rows: bytes
+    first: int
+    count: int
     about: dict[str, Any]
 
 
-def compute(task: Task) -> list[Result]:
+def compute(task: Task, trace: Trace | None = None, shared: RowsFile | None = None) -> list[Result]:
     """Replay once for each convention, and score.
+
+    Args:
+        task: what to do.
+        trace: the task's, where it has been read; by default it is read here.
+        shared: the file that the rows go to; by default each cell has its own.
 
     Raises:
         LaeError: whatever replaying and scoring raise.
     """
+    setting = task.cells[0].setting
+    if trace is None:
+        trace = held(read_trace(setting.trace.path, setting.sequences or None))
     conventions = dict.fromkeys(cell.convention for cell in task.cells)
     return [
         result
         for convention in conventions
         for result in _computed(
-            [cell for cell in task.cells if cell.convention == convention], task.factories
+            [cell for cell in task.cells if cell.convention == convention],
+            task.factories,
+            trace,
+            shared,
         )
     ]
 
 
-def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> list[Result]:
+def _computed(
+    cells: Sequence[Cell],
+    factories: Mapping[str, AnyFactory],
+    trace: Trace,
+    shared: RowsFile | None,
+) -> list[Result]:
     """The results of cells of one setting and one convention."""
     setting = cells[0].setting
     world, convention = setting.world, find_convention(cells[0].convention)
-    trace = held(read_trace(setting.trace.path, setting.sequences or None))
     chosen = {cell.forecaster: factories[cell.forecaster] for cell in cells}
     costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
-    writers = [CellRows(world.sigmas, cell.about(trace.metadata)) for cell in cells]
+    writers = [CellRows(world.sigmas, cell.about(trace.metadata), shared) for cell in cells]
     replay = replayed(setting, trace)
     repetitions: list[int] = []
 
@@ -285,7 +303,7 @@ def _computed(cells: Sequence[Cell], factories: Mapping[str, AnyFactory]) -> lis
                 *cost_notes({cell.forecaster: cell.cost_ns} if cell.cost_ns else {}),
             ],
         }
-        results.append(Result(cell.key, writer.finish(), details))
+        results.append(Result(cell.key, *writer.finish(), details))
     return results
 
 
@@ -355,7 +373,7 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
     """
     name = setting.world.pre_forecaster
     searches = None if name is None else load_forecaster(name)
-    runs = setting.world.replay(trace, batch=True, pre_forecaster=searches)
+    runs = setting.world.replay(trace, pre_forecaster=searches)
     times = runs.source(next(iter(runs.times)))
     in_lanes = batchable([times], runs.policy) and runs.arrivals != "recorded"
     made: Iterable[tuple[int, Run]] = ((0, run) for run in runs)

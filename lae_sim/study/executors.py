@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from lae_sim.decoding import allowing
 from lae_sim.errors import LaeError, install, one_line, shown
@@ -28,6 +29,45 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class RunAll(Protocol):
+    """Hands items out to workers: each comes back with what a function made of it."""
+
+    def __call__(
+        self, work: Callable[[Item], Any], items: Iterable[Item]
+    ) -> Generator[tuple[Item, Any], None, None]:
+        """Each item with what the function makes of it, as they are finished; to be closed."""
+
+
+@contextmanager
+def at_work(workers: int, scheduler: str | None = None) -> Iterator[RunAll]:
+    """Workers for several rounds of work; processes start when there is some.
+
+    Args:
+        workers: processes on this machine; with one it runs in this process.
+        scheduler: address of a Dask cluster to run on instead.
+
+    Raises:
+        LaeError: if there is no such cluster, or Dask is not installed; where the work is handed
+            out, if a worker died and nobody takes its place.
+    """
+    if scheduler is not None:
+        with _cluster(scheduler) as (executor, threads):
+            yield partial(_handed_out, executor=executor, workers=threads)
+    elif workers > 1:
+        with _processes(workers) as executor:
+            yield partial(_handed_out, executor=executor, workers=lambda: workers)
+    else:
+        yield run_here
+
+
+def run_here(
+    work: Callable[[Item], Any], items: Iterable[Item]
+) -> Generator[tuple[Item, Any], None, None]:
+    """Each item with what a function makes of it, in this process."""
+    for item in items:
+        yield item, work(item)
+
+
 def run_all(
     work: Callable[[Item], Any], items: Iterable[Item], workers: int, scheduler: str | None = None
 ) -> Generator[tuple[Item, Any], None, None]:
@@ -36,22 +76,14 @@ def run_all(
     Args:
         work: a function of a module, that workers can import.
         items: handed out as workers become free.
-        workers: processes on this machine; with one it runs in this process.
-        scheduler: address of a Dask cluster to run on instead.
+        workers, scheduler: see :func:`at_work`.
 
     Raises:
         LaeError: if a worker died, and nobody takes its place; if there is no such cluster, or
             Dask is not installed.
     """
-    if scheduler is not None:
-        with _cluster(scheduler) as (executor, threads):
-            yield from _handed_out(work, items, executor, threads)
-    elif workers > 1:
-        with _processes(workers) as executor:
-            yield from _handed_out(work, items, executor, lambda: workers)
-    else:
-        for item in items:
-            yield item, work(item)
+    with at_work(workers, scheduler) as run:
+        yield from run(work, items)
 
 
 def _handed_out(
@@ -59,7 +91,7 @@ def _handed_out(
     items: Iterable[Item],
     executor: Executor,
     workers: Callable[[], int],
-) -> Iterator[tuple[Item, Any]]:
+) -> Generator[tuple[Item, Any], None, None]:
     """Each item with what a function makes of it, by as many workers as there are at the moment."""
     waiting = iter(items)
     work = allowing(work)

@@ -23,6 +23,8 @@ def run_name(trace: str, times_from: str) -> str:
 class Record:
     """What the results of a study consist of."""
 
+    __slots__ = ()
+
     def flat(self) -> dict[str, Plain]:
         """The flat row of JSON and CSV: unknown values are None, what is not asked has no key."""
         return _plain(self)
@@ -39,7 +41,7 @@ def _plain(record: Any, until: str = "") -> dict[str, Plain]:
     return row
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Uncertainty:
     """How sure the mean of a score is, and what is won over hold.
 
@@ -74,7 +76,7 @@ class Uncertainty:
         return dict(row)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Behind:
     """How far a tracker and forecaster is behind the best of its setting.
 
@@ -100,7 +102,7 @@ class Behind:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Staleness:
     """How old answers are, and when they first miss the target.
 
@@ -126,7 +128,7 @@ class Staleness:
         return _plain(self, until="failed" if self.failed is None else "")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Modelled:
     """Mean scores under the search model.
 
@@ -153,7 +155,7 @@ class Modelled:
         return row
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class SummaryRow(Record):
     """The means of one trace, setting, convention, forecaster and sigma.
 
@@ -245,7 +247,7 @@ class SummaryRow(Record):
         return row if self.behind is None else row | self.behind.columns()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Comparison(Record):
     """Two traces of one dataset against each other, in one setting, with one forecaster.
 
@@ -295,7 +297,7 @@ class Comparison(Record):
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Requirement(Record):
     """What a required AUC asks of a device and of the world.
 
@@ -366,7 +368,7 @@ class Requirement(Record):
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Failure(Record):
     """A piece of work that could not be done.
 

@@ -67,20 +67,64 @@ model off.
 """
 
 
-class CellRows:
-    """Writes the rows of one cell, group after group, as a Parquet file in memory."""
+class RowsFile:
+    """A Parquet file in memory, of the rows of one cell or of several."""
 
-    def __init__(self, sigmas: Sequence[Fraction], about: Mapping[str, str]) -> None:
+    def __init__(self) -> None:
         import pyarrow.parquet as pq
 
-        self._sigmas = np.array([float(sigma) for sigma in sigmas])
-        self._about = about
-        self._schema = _schema()
+        self.rows = 0
         self._file = io.BytesIO()
         texts = [name for name, kind in COLUMNS.items() if kind == "string"]
         self._writer = pq.ParquetWriter(
-            self._file, self._schema, compression="zstd", use_dictionary=texts
+            self._file, _schema(), compression="zstd", use_dictionary=texts
         )
+        self._waiting: list[Any] = []
+
+    def write(self, batch: Any, soon: bool = True) -> None:
+        """Add rows; those that need not be written soon share a row group with what follows."""
+        self._waiting.append(batch)
+        self.rows += batch.num_rows
+        if soon:
+            self._flush()
+
+    def undo(self, rows: int) -> None:
+        """Take away what was written after so many rows, and not soon."""
+        while self.rows > rows:
+            self.rows -= self._waiting.pop().num_rows
+
+    def _flush(self) -> None:
+        import pyarrow as pa
+
+        if self._waiting:
+            self._writer.write_table(pa.Table.from_batches(self._waiting).combine_chunks())
+        self._waiting.clear()
+
+    def finish(self) -> bytes:
+        """The file's bytes."""
+        self._flush()
+        self._writer.close()
+        return self._file.getvalue()
+
+
+class CellRows:
+    """Writes the rows of one cell, group after group.
+
+    Args:
+        sigmas: the permitted latencies.
+        about: the columns that are the same in all rows.
+        shared: the file that other cells' rows are in too; by default it has one of its own.
+    """
+
+    def __init__(
+        self, sigmas: Sequence[Fraction], about: Mapping[str, str], shared: RowsFile | None = None
+    ) -> None:
+        self._sigmas = np.array([float(sigma) for sigma in sigmas])
+        self._about = about
+        self._schema = _schema()
+        self._file = RowsFile() if shared is None else shared
+        self._is_alone = shared is None
+        self._waiting: list[Any] = []
 
     def add(self, part: Evaluation, f: int, repetitions: npt.NDArray[np.int32]) -> None:
         """Add a row for each sequence of a part and each sigma."""
@@ -120,12 +164,20 @@ class CellRows:
             **{name: from_numpy(column.astype(COLUMNS[name])) for name, column in values.items()},
         }
         arrays = [columns[name] for name in COLUMNS]
-        self._writer.write_batch(pa.record_batch(arrays, schema=self._schema))
+        rows_of_part = pa.record_batch(arrays, schema=self._schema)
+        if self._is_alone:
+            self._file.write(rows_of_part)
+        else:
+            self._waiting.append(rows_of_part)  # a cell's rows stand together
 
-    def finish(self) -> bytes:
-        """The file's bytes."""
-        self._writer.close()
-        return self._file.getvalue()
+    def finish(self) -> tuple[bytes, int, int]:
+        """The file's bytes, none of a shared one; the first row in it, and how many."""
+        if self._is_alone:
+            return self._file.finish(), 0, self._file.rows
+        first = self._file.rows
+        for batch in self._waiting:
+            self._file.write(batch, soon=False)
+        return b"", first, self._file.rows - first
 
 
 def _modelled(part: Evaluation, f: int) -> dict[str, Floats]:
@@ -143,8 +195,8 @@ def _schema() -> Any:
     return pa.schema([pa.field(name, kind) for name, kind in COLUMNS.items()])
 
 
-def read_rows(path: Path, columns: Sequence[str]) -> Any:
-    """Some columns of a cell's file, as one Arrow table of one chunk.
+def read_rows(path: Path, columns: Sequence[str] | None = None) -> Any:
+    """Some columns of a file of rows, or all, as one Arrow table of one chunk.
 
     Raises:
         LaeError: if the file is damaged; it says what to do.

@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -22,26 +22,34 @@ from lae_sim.evaluation.caveats import at_the_floor, floor_notes
 from lae_sim.files import check_distinct, csv_cell, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
-from lae_sim.study.cells import Task
-from lae_sim.study.deployment import Curve, requirement, searches
-from lae_sim.study.executors import cores, run_all
+from lae_sim.study.cells import Result, Task
+from lae_sim.study.comparisons import PairsFile, Rivals, rivals_of
+from lae_sim.study.deployment import Curve, Search, requirement, searches
+from lae_sim.study.executors import RunAll, at_work, cores, run_here
+from lae_sim.study.pairs import Pairs
 from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import MEAN, Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
 from lae_sim.study.store import Store
 from lae_sim.study.summary import (
     Scores,
-    compare_traces,
     rankings_of,
     read_scores,
     summarise_study,
 )
 from lae_sim.study.verdict import verdict
-from lae_sim.study.work import Description, Work, attempt
+from lae_sim.study.work import Batch, Description, Done, Work, attempt, attempt_batch, batches
 from lae_sim.trace.describe import is_measured
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+
+PAIRS = "comparisons.parquet"
+"""The file of all pairs of traces."""
+
+FEW = 30_000
+"""Pairs, counted twice, that are sooner compared here than handed to workers."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,7 +61,9 @@ class StudyResults:
         plan: what was computed.
         scores: of every finished trace, setting, convention and forecaster.
         summary: means (see :func:`lae_sim.study.summary.summarise_study`).
-        comparisons: pairs of traces (see :func:`lae_sim.study.summary.compare_traces`).
+        comparisons: pairs of traces, those of each setting with its best if there are too many to
+            hold (see :data:`lae_sim.study.comparisons.MOST`): all are in ``comparisons.parquet``.
+        pairs: how many there are in all.
         required: what a required AUC asks for (see :func:`lae_sim.study.deployment.requirement`).
         traces: what ``lae-sim show --json`` says of each trace, as it says it.
         computed: how many cells were computed now, and not found finished.
@@ -84,6 +94,7 @@ class StudyResults:
     scores: tuple[Scores, ...]
     summary: tuple[SummaryRow, ...]
     comparisons: tuple[Comparison, ...]
+    pairs: int
     required: tuple[Requirement, ...]
     traces: tuple[dict[str, Any], ...]
     computed: int
@@ -92,11 +103,12 @@ class StudyResults:
 
     def to_frame(self) -> DataFrame:
         """Every score of every sequence, repetition and sigma (see :mod:`lae_sim.study.rows`)."""
-        import pandas as pd
+        import pyarrow as pa
 
         store = Store(self.folder)
-        files = [store.rows(cell) for cell in self.plan.cells if store.has(cell)]
-        return pd.concat(map(pd.read_parquet, files), ignore_index=True)
+        store.open()
+        tables = [store.rows(cell) for cell in self.plan.cells if store.has(cell)]
+        return pa.concat_tables(tables).to_pandas()
 
     def summary_frame(self) -> DataFrame:
         """The summary as a table: the columns of ``summary.csv``."""
@@ -268,7 +280,8 @@ def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathL
         LaeError: if it is, or if a folder stands where a file is to be, or a file for a folder.
     """
     written = [Path(folder, f"{name}.csv") for name in ("summary", "comparisons", "required")]
-    written += [Path(folder, name) for name in ("study.json", "report.html", "contents.json")]
+    names = ("study.json", "report.html", "contents.json", PAIRS)
+    written += [Path(folder, name) for name in names]
     folders = [Path(folder, name) for name in ("figures", "tables")]
     inside = [path for each in folders for path in each.glob("*")]
     for path in (*written, *(path for path in inside if path.suffix)):
@@ -300,52 +313,109 @@ def _run(
         *tasks(cells, factories),
         *(replace(search, factory=factories[search.cell.forecaster]) for search in sought),
     ]
-    failures, computed = [], 0
-    workers = min(workers or cores(), max(len(works), 1))
     frames = {source.input: source.frames for source in plan.sources}
+    pieces = [*batches(works, frames)]
+    workers = min(workers or cores(), max(len(pieces), 1))
     share = sum(
         amount(frames[cell.setting.trace] * cell.setting.count, len(study.sigmas)) for cell in cells
     )
-    attempted = partial(attempt, share=share // workers)
+    attempted = partial(attempt_batch, share=share // workers)
+    failures: list[Failure] = []
+    computed = 0
     # closed whatever happens here, or workers would outlive the study
-    with closing(run_all(attempted, works, workers, scheduler)) as attempts:
-        for done, (work, result) in enumerate(attempts, 1):
-            progress("", done, len(works))
-            if isinstance(result, Failure):
-                failures.append(result)
-            elif isinstance(work, Task):
-                for of_cell in result:
-                    if isinstance(of_cell, Failure):
-                        failures.append(of_cell)
-                    else:
-                        store.put(of_cell)
-                        computed += 1
-            else:
-                store.keep(work.key, result)
-    progress("summing up", len(works), len(works))
-    scores = tuple(read_scores(plan, store))
-    if not scores:
-        raise LaeError(f"nothing could be computed: {failures[0].reason}")
+    with at_work(workers, scheduler) as run:
+        with closing(run(attempted, pieces)) as attempts:
+            for done, (batch, result) in enumerate(attempts, 1):
+                progress("", done, len(pieces))
+                computed += _keep(batch, result, store, failures)
+        scores = tuple(read_scores(plan, store))
+        if not scores:
+            raise LaeError(f"nothing could be computed: {failures[0].reason}")
+        compared = _compare(scores, study.seed, store, run, failures, progress)
+    progress("summing up", len(pieces), len(pieces))
     answers = ((search, store.document(search.key)) for search in asked)
     results = StudyResults(
         folder=store.folder,
         plan=plan,
         scores=scores,
         summary=tuple(summarise_study(scores, study.seed)),
-        comparisons=tuple(compare_traces(scores, study.seed)),
+        comparisons=compared[0],
+        pairs=compared[1],
         required=tuple(
             requirement(search, Curve(**answer), auc)
             for search, answer in answers
             if answer
             for auc in search.required
         ),
-        traces=tuple(filter(None, (store.document(each.key) for each in described))),
+        traces=tuple(
+            dict(trace)
+            for trace in (store.document(each.key) for each in described)
+            if trace is not None
+        ),
         computed=computed,
         failures=tuple(sorted(failures, key=lambda failure: str(failure.flat()))),
         training=tuple(training),
     )
     _write(results)
     return results
+
+
+def _keep(batch: Batch, done: Done, store: Store, failures: list[Failure]) -> int:
+    """Keep what came of a batch; how many cells were computed."""
+    results: list[Result] = []
+    documents = {}
+    for work, found in zip(batch.works, done.found):
+        if isinstance(found, Failure):
+            failures.append(found)
+        elif isinstance(work, Task):
+            failures += [each for each in found if isinstance(each, Failure)]
+            results += [each for each in found if isinstance(each, Result)]
+        elif isinstance(work, (Description, Search)):
+            documents[work.key] = found
+    store.put(results, documents, done.rows)
+    return len(results)
+
+
+def _compare(
+    scores: Sequence[Scores],
+    seed: int,
+    store: Store,
+    run: RunAll,
+    failures: list[Failure],
+    progress: Callable[[str, int, int], object],
+) -> tuple[tuple[Comparison, ...], int]:
+    """The pairs that are held (see :data:`.comparisons.MOST`), and how many there are in all.
+
+    They are computed on the workers, but for a few, and kept in the file of all pairs.
+    """
+    rivals = rivals_of(scores, rankings_of(scores), seed)
+    pairs = PairsFile(store.folder / PAIRS, store.document("pairs"))
+    if not rivals:
+        pairs.path.unlink(missing_ok=True)
+        return (), 0
+    missing = [each for each in rivals if each.key not in pairs.places]
+    if missing or [each.key for each in rivals] != list(pairs.places):
+        few = sum(len(each.members) ** 2 for each in missing) < FEW
+        with closing((run_here if few else run)(attempt, missing)) as attempts:
+            early: dict[str, Pairs | None] = {}  # before their turn
+            done = 0
+
+            def found(wanted: Rivals) -> Pairs | None:
+                """The pairs of some rivals, when their turn has come; None of what failed."""
+                nonlocal done
+                while wanted.key not in early:
+                    each, result = next(attempts)
+                    done += 1
+                    if not few:
+                        progress("pairs of traces", done, len(missing))
+                    is_failure = isinstance(result, Failure)
+                    failures.extend([result] if is_failure else [])
+                    early[each.key] = None if is_failure else result
+                return early.pop(wanted.key)
+
+            pairs.write(rivals, found)
+        store.keep("pairs", pairs.document())
+    return tuple(pairs.records(rivals)), pairs.total
 
 
 def _factories(
@@ -375,8 +445,26 @@ def _write(results: StudyResults) -> None:
             write_csv(records, path)
         else:
             path.unlink(missing_ok=True)
-    with written_whole(results.folder / "study.json") as temporary:
-        temporary.write_text(json.dumps(results.document(), allow_nan=False), "utf-8")
+    with (
+        written_whole(results.folder / "study.json") as temporary,
+        open(temporary, "w", encoding="utf-8") as file,
+    ):
+        file.writelines(_json(results.document()))
+
+
+def _json(document: Mapping[str, Any]) -> Iterator[str]:
+    """The text of a document, a line of its lists at a time: as a whole it may be large."""
+    yield "{"
+    for place, (key, value) in enumerate(document.items()):
+        yield f"{', ' * bool(place)}{json.dumps(key)}: "
+        if isinstance(value, (list, tuple)):
+            yield "["
+            for i, each in enumerate(value):
+                yield f"{', ' * bool(i)}{json.dumps(each, allow_nan=False)}"
+            yield "]"
+        else:
+            yield json.dumps(value, allow_nan=False)
+    yield "}"
 
 
 def write_csv(records: Sequence[Record], path: Path) -> None:

@@ -5,25 +5,73 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from sys import intern
 from typing import Any
+
+import numpy as np
 
 from lae_sim.errors import LaeError
 from lae_sim.files import locked, remove_leftovers, text_digest, written_whole
 from lae_sim.study.cells import Cell, Result
+from lae_sim.study.rows import RowsFile, read_rows
 
-_CELLS = "[0-9a-f]" * 32 + ".parquet"
+_FILES = "[0-9a-f]" * 32 + ".parquet"
 _BYTES, _DIGEST = "rows_bytes", "sha256"  # what the files say of themselves
+
+
+@dataclass(frozen=True)
+class Part:
+    """A file of rows, and what is said of it.
+
+    Attributes:
+        name: of both files, without suffix.
+        size: of the file of rows, bytes.
+        cells: by key what is known of each cell beside its rows (see :class:`Result`).
+        places: the first row of each cell, and how many it has.
+        documents: others that were made together with these, by their keys.
+    """
+
+    name: str
+    size: int
+    cells: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    places: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, results: Sequence[Result], documents: Mapping[str, Mapping[str, Any]], size: int
+    ) -> Part:
+        """That of some results which share a file of so many bytes."""
+        keys = [*(result.key for result in results), *documents]
+        return cls(
+            name=keys[0] if len(keys) == 1 else text_digest(" ".join(keys)),
+            size=size,
+            cells={result.key: _packed(result.about) for result in results},
+            places={result.key: (result.first, result.count) for result in results},
+            documents=documents,
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """What its file holds."""
+        return {
+            "cells": {key: _unpacked(about) for key, about in self.cells.items()},
+            "places": {key: list(place) for key, place in self.places.items()},
+            "documents": self.documents,
+            _BYTES: self.size,
+        }
 
 
 class Store:
     """The folder of a study's finished cells.
 
-    ``results`` holds exactly the cells of the plan, as one Parquet dataset; ``about`` says more of
-    each; ``unused`` keeps finished cells of other plans, in case they are wanted again. What is
-    not as it was written, cut off or edited, counts as not there, and is computed again.
+    ``results`` holds exactly the cells of the plan, as one Parquet dataset of files of a cell, or
+    of many small ones; ``about`` says more of each; ``unused`` keeps finished cells of other
+    plans, in case they are wanted again. What is not as it was written, cut off or edited, counts
+    as not there, and is computed again.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -31,6 +79,8 @@ class Store:
         self.results, self._about, self._unused = (
             self.folder / name for name in ("results", "about", "unused")
         )
+        self._parts: dict[str, Part] = {}  # by the keys of their cells and documents
+        self._read: tuple[object, Any] | None = None
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -66,57 +116,176 @@ class Store:
                 with tempfile.TemporaryFile(dir=path):
                     pass
                 remove_leftovers(path)
-            wanted = {f"{cell.key}.parquet" for cell in cells}
-            for path in self.results.glob(_CELLS):
-                if path.name not in wanted:
-                    path.replace(self._unused / path.name)
-            for path in self._unused.glob(_CELLS):
-                if path.name in wanted:
-                    path.replace(self.results / path.name)
+            self._sort({cell.key for cell in cells})
         except OSError as error:
             raise LaeError(f"{self.folder}: {error.strerror or error}") from error
 
+    def open(self) -> None:
+        """Look at what a finished study left, without changing anything."""
+        for part, rows in self._found():
+            if rows.parent == self.results:
+                self._remember(part, part.cells)
+
+    def _sort(self, wanted: set[str]) -> None:
+        """Move the files to where they belong, and divide those that belong to both."""
+        here: set[Path] = set()
+        for part, place in [*self._found()]:
+            kept = {key for key in part.cells if key in wanted and key not in self._parts}
+            if kept and len(kept) < len(part.cells):
+                self._divide(part, place, kept)
+                continue
+            if part.cells:
+                target = (self.results if kept else self._unused) / place.name
+                if target != place:
+                    place.replace(target)
+                here |= {target} if kept else set()
+            self._remember(part, kept)
+        here |= {*self.files}
+        for path in self.results.glob(_FILES):
+            if path not in here:  # of what is not as it was written
+                path.unlink()
+
+    def _remember(self, part: Part, cells: Iterable[str]) -> None:
+        for key in (*cells, *part.documents):
+            self._parts[key] = part
+
+    def _found(self) -> Iterator[tuple[Part, Path]]:
+        """What is whole, with the file of its rows, in the order of the names."""
+        for path in sorted(self._about.glob("*.json")):
+            document = self._document(path.stem)
+            if document is None or "cells" not in document:
+                continue
+            part = Part(
+                path.stem,
+                document[_BYTES],
+                {key: _packed(about) for key, about in document["cells"].items()},
+                {key: (first, count) for key, (first, count) in document["places"].items()},
+                document["documents"],
+            )
+            for folder in (self.results, self._unused):
+                rows = folder / f"{path.stem}.parquet"
+                if not part.cells or (rows.is_file() and rows.stat().st_size == part.size):
+                    yield part, rows
+                    break
+
+    def _divide(self, part: Part, place: Path, kept: set[str]) -> None:
+        """Divide a file into one of the cells that are kept, and one of the others."""
+        table = read_rows(place)
+        for folder, chosen in (
+            (self.results, [key for key in part.cells if key in kept]),
+            (self._unused, [key for key in part.cells if key not in kept]),
+        ):
+            file, results = RowsFile(), []
+            for key in chosen:
+                first, count = part.places[key]
+                for batch in table.slice(first, count).to_batches():
+                    file.write(batch, soon=False)
+                first = file.rows - count
+                results.append(Result(key, b"", first, count, dict(part.cells[key])))
+            documents = part.documents if folder == self.results else {}
+            self._put(results, documents, file.finish(), folder)
+        place.unlink()
+        self._details(part.name).unlink()
+
     def has(self, cell: Cell) -> bool:
         """Whether a cell is finished, and its files are whole."""
-        about, rows = self.document(cell.key), self.rows(cell)
-        return about is not None and rows.is_file() and rows.stat().st_size == about.get(_BYTES)
+        return cell.key in self._parts
 
-    def put(self, result: Result) -> None:
-        """Keep a result; its rows come last, and say that it is finished."""
-        self.keep(result.key, {**result.about, _BYTES: len(result.rows)})
-        with written_whole(self.results / f"{result.key}.parquet") as temporary:
-            temporary.write_bytes(result.rows)
+    def put(
+        self,
+        results: Sequence[Result],
+        documents: Mapping[str, Mapping[str, Any]] | None = None,
+        rows: bytes = b"",
+    ) -> None:
+        """Keep results and documents; their rows come last, and say that they are finished.
 
-    def document(self, key: str) -> dict[str, Any] | None:
+        Args:
+            results: of cells.
+            documents: by their keys, kept together with the results.
+            rows: the file of all of them; by default each has its own.
+        """
+        if not rows:
+            for result in results:
+                self._put([result], {}, result.rows, self.results)
+            results = []
+        if results or documents:
+            self._put(results, documents or {}, rows, self.results)
+
+    def _put(
+        self,
+        results: Sequence[Result],
+        documents: Mapping[str, Mapping[str, Any]],
+        rows: bytes,
+        folder: Path,
+    ) -> None:
+        part = Part.of(results, documents, len(rows))
+        self._write(part.name, part.plain())
+        if results:
+            with written_whole(folder / f"{part.name}.parquet") as temporary:
+                temporary.write_bytes(rows)
+        self._remember(part, part.cells if folder == self.results else ())
+
+    def document(self, key: str) -> Mapping[str, Any] | None:
         """A document that was kept under a key, if it was, and is as it was written."""
+        part = self._parts.get(key)
+        return part.documents[key] if part is not None else self._document(key)
+
+    def keep(self, key: str, document: Mapping[str, Any]) -> None:
+        """Keep a document under a key, with its digest."""
+        self._write(key, document)
+
+    def _document(self, name: str) -> dict[str, Any] | None:
         with suppress(OSError, ValueError, RecursionError):
-            document = json.loads(self._details(key).read_text("utf-8"))
+            document = json.loads(self._details(name).read_text("utf-8"))
             if isinstance(document, dict) and document.pop(_DIGEST, None) == _digest(document):
                 return document
         return None
 
-    def keep(self, key: str, document: Mapping[str, Any]) -> None:
-        """Keep a document under a key, with its digest."""
+    def _write(self, name: str, document: Mapping[str, Any]) -> None:
         text = json.dumps({**document, _DIGEST: _digest(document)}, allow_nan=False)
-        with written_whole(self._details(key)) as temporary:
+        with written_whole(self._details(name)) as temporary:
             temporary.write_text(text, "utf-8")
 
-    def rows(self, cell: Cell) -> Path:
-        """The file of a cell's rows."""
-        return self.results / f"{cell.key}.parquet"
+    @property
+    def files(self) -> list[Path]:
+        """The files of rows, in the order of their names."""
+        names = {part.name for part in self._parts.values() if part.cells}
+        return [self.results / f"{name}.parquet" for name in sorted(names)]
 
-    def about(self, cell: Cell) -> dict[str, Any]:
-        """What is known of a finished cell beside its rows (see :class:`Result`).
+    def rows(self, cell: Cell, columns: Sequence[str] | None = None) -> Any:
+        """The rows of a cell, or some columns of them, as an Arrow table of one chunk.
 
         Raises:
-            LaeError: if its file is damaged.
+            LaeError: if the file is damaged; it says what to do.
         """
-        if (document := self.document(cell.key)) is None:
-            raise LaeError(f"{self._details(cell.key)}: damaged: run the study again")
-        return document
+        part = self._parts[cell.key]
+        wanted = part.name, None if columns is None else tuple(columns)
+        if self._read is None or self._read[0] != wanted:
+            self._read = wanted, read_rows(self.results / f"{part.name}.parquet", columns)
+        return self._read[1].slice(*part.places[cell.key])
+
+    def about(self, cell: Cell) -> Mapping[str, Any]:
+        """What is known of a finished cell beside its rows (see :class:`Result`)."""
+        return self._parts[cell.key].cells[cell.key]
 
     def _details(self, key: str) -> Path:
         return self._about / f"{key}.json"
+
+
+def _packed(about: Mapping[str, Any]) -> dict[str, Any]:
+    """What is known of a cell, with its curves as arrays: lists take four times the memory."""
+    curves = about["curves"].items()
+    packed = {name: None if curve is None else np.asarray(curve) for name, curve in curves}
+    return {**about, "curves": packed, "notes": [*map(intern, about["notes"])]}
+
+
+def _unpacked(about: Mapping[str, Any]) -> dict[str, Any]:
+    """The same as JSON has it."""
+    curves = about["curves"].items()
+    return {
+        **about,
+        "curves": {name: None if curve is None else curve.tolist() for name, curve in curves},
+    }
 
 
 def _digest(document: Mapping[str, Any]) -> str:

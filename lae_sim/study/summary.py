@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import combinations
+from sys import intern
 from typing import Any
 
 import numpy as np
@@ -26,13 +26,12 @@ from lae_sim.study.plan import Plan, Source
 from lae_sim.study.records import (
     MEAN,
     Behind,
-    Comparison,
     Modelled,
     Staleness,
     SummaryRow,
     Uncertainty,
 )
-from lae_sim.study.rows import COLUMNS, read_rows
+from lae_sim.study.rows import COLUMNS
 from lae_sim.study.store import Store
 from lae_sim.trace.columns import to_numpy
 
@@ -57,6 +56,7 @@ class Scores:
             ``lost_share`` and the offline scores, float64 [S].
         modelled_sequences: in how many the search model says something.
         about: of each cell (see :class:`lae_sim.study.cells.Result`).
+        keys: of each cell.
     """
 
     source: Source
@@ -70,6 +70,7 @@ class Scores:
     once: Mapping[str, Floats]
     about: tuple[Mapping[str, Any], ...]
     modelled_sequences: int
+    keys: tuple[str, ...]
 
     @property
     def known(self) -> bool | None:
@@ -141,7 +142,7 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
     names: tuple[str, ...] = ()
     for cell in cells:
         wanted = dict.fromkeys([*numbers, *_REPEATED, *_ONCE])
-        rows = read_rows(store.rows(cell), [*wanted, "sequence", "repetition"])
+        rows = store.rows(cell, [*wanted, "sequence", "repetition"])
         exact = np.isnan(_column(rows, "lost_share"))
 
         def column(name: str, rows: Any = rows, exact: Bools = exact) -> Floats:
@@ -153,7 +154,7 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
         entries = rows.num_rows // count
         sequences = rows.column("sequence").chunk(0)  # its take would import pyarrow.compute
         of_entry = [sequences[row].as_py() for row in range(0, rows.num_rows, count)]
-        names = tuple(sorted(set(of_entry)))
+        names = tuple(map(intern, sorted(set(of_entry))))
         place = {name: s for s, name in enumerate(names)}
         order = np.lexsort((  # by repetition, then by sequence
             np.array([place[name] for name in of_entry]), column("repetition")[::count],
@@ -188,6 +189,7 @@ def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
         once={name: totals[name] for name in _ONCE},
         about=about,
         modelled_sequences=0 if applies is None else int(applies.sum()),
+        keys=tuple(cell.key for cell in cells),
     )
 
 
@@ -454,65 +456,6 @@ def _mean_of_means(values: Floats) -> float | None:
     return float(np.mean(known)) if len(known) == len(means) else None
 
 
-def compare_traces(
-    scores: Sequence[Scores], seed: int = 0, resamples: int = RESAMPLES
-) -> list[Comparison]:
-    """Traces of one dataset against each other: in every setting, with every forecaster.
-
-    Returns:
-        A comparison per pair that has sequences in common, at the first sigma (or, on the whole
-        grid of sigmas, of the means over it); p-values are corrected (:func:`.statistics.holm`)
-        for the number of pairs of the same setting and forecaster.
-    """
-    bootstrap, rankings = Bootstrap(resamples, seed), rankings_of(scores)
-    together: dict[tuple[str, ...], list[Scores]] = {}
-    for each in scores:
-        together.setdefault((*each.group, each.forecaster), []).append(each)
-    comparisons = []
-    for group in together.values():
-        ranking = rankings[group[0].group]
-        pairs = [_pair(a, b, ranking, bootstrap) for a, b in combinations(group, 2)]
-        known = [pair for pair in pairs if pair is not None]
-        corrected = holm([pair.difference.p for pair in known])
-        comparisons += [replace(pair, p_holm=p) for pair, p in zip(known, corrected)]
-    return comparisons
-
-
-def _pair(a: Scores, b: Scores, ranking: Ranking, bootstrap: Bootstrap) -> Comparison | None:
-    """A against B; None if they have no sequences in common that count."""
-    setting = a.setting
-    whole = set(SIGMA_GRID) == set(setting.world.sigmas)
-    first, second = _paired(a, b, ranking, whole)
-    if not first.size:
-        return None
-    differences = first.mean(axis=0) - second.mean(axis=0)
-    [margins] = bootstrap.means(differences[None])
-    difference = bootstrap.compare(differences, 0.0, margins, 0.0)
-    jitter = len(first) > 1 or len(second) > 1
-    if jitter:
-        margins = _drawn_margins(first, second, bootstrap)
-    here = first.mean(axis=1)[:, None] - second.mean(axis=1)
-    return Comparison(
-        dataset=a.source.metadata.dataset,
-        policy=setting.policy,
-        fps=setting.fps,
-        latency=setting.latency,
-        scale=setting.world.scale,
-        search=setting.world.search,
-        pre_forecaster=setting.pre_forecaster,
-        convention=a.convention,
-        forecaster=a.forecaster,
-        sigma=MEAN if whole else setting.world.sigmas[0],
-        a=setting.run,
-        b=b.setting.run,
-        sequences=len(differences),
-        difference=difference,
-        better_here=_superiority(here) if jitter else None,
-        better=_superiority(margins),
-        ranked_by=ranking.by,
-    )
-
-
 def _paired(a: Scores, b: Scores, ranking: Ranking, over_sigmas: bool) -> tuple[Floats, Floats]:
     """The AUCs that count of the sequences that have one in both, float64 [R, S] each."""
     both = sorted(set(a.sequences) & set(b.sequences))
@@ -530,22 +473,3 @@ def ranked(values: Mapping[str, Floats], ranking: Ranking) -> Floats:
     """The AUC that counts, of ``means``, ``repeated`` or ``over_sigmas`` of some scores."""
     name = "modelled_auc" if ranking.modelled else "auc"
     return values.get(name, values["auc"])  # without the first where the replay is exact
-
-
-def _superiority(margins: Floats) -> float:
-    """How probable a margin above 0 is; one of 0 counts half."""
-    return float((np.sign(np.round(margins, 12)).mean() + 1) / 2)
-
-
-def _drawn_margins(first: Floats, second: Floats, bootstrap: Bootstrap) -> Floats:
-    """Differences in resamples of the sequences, each with a repetition drawn for each sequence."""
-    counts = bootstrap.counts(first.shape[1])
-    resamples, count = counts.shape
-    random = np.random.Generator(np.random.PCG64([bootstrap.seed, count, len(first), len(second)]))
-    margins = np.zeros(resamples)
-    for s in range(count):  # one sequence after another: resamples x sequences would be large
-        run = first[random.integers(0, len(first), resamples), s]
-        margins += (
-            counts[:, s] / count * (run - second[random.integers(0, len(second), resamples), s])
-        )
-    return margins

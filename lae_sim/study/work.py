@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from itertools import chain
 from typing import Any, TypeAlias
 
 from lae_sim import __version__
@@ -10,8 +12,11 @@ from lae_sim._compiled import expect
 from lae_sim.errors import LaeError, explained
 from lae_sim.files import text_digest
 from lae_sim.study.cells import Cell, Input, Result, Setting, Task, compute
+from lae_sim.study.comparisons import Rivals
 from lae_sim.study.deployment import Search, measured
 from lae_sim.study.records import Failure
+from lae_sim.study.rows import RowsFile
+from lae_sim.trace.file import Trace, held, read_trace
 from lae_sim.trace.locate import digest, stamp
 
 
@@ -33,54 +38,148 @@ class Description:
         return text_digest(repr((__version__, self.trace.label, self.trace.digest, self.sequences)))
 
 
-Work: TypeAlias = Description | Task | Search
+Work: TypeAlias = Description | Task | Search | Rivals
+
+BATCH = 1 << 16
+"""World frames that small pieces of work come to together, about, each as often as it is scored."""
+
+_TRIED = 60  # scales, in a search
 
 
-def attempt(work: Work, share: int = 0) -> Any:
-    """Do a piece of work, on some worker; what cannot be done is a :class:`Failure`.
+@dataclass(frozen=True)
+class Batch:
+    """Pieces of work that are done one after another, in one process.
+
+    Attributes:
+        works: of one trace after another.
+    """
+
+    works: tuple[Work, ...]
+
+
+@dataclass(frozen=True)
+class Done:
+    """What came of a batch.
+
+    Attributes:
+        found: of each piece (see :func:`attempt`).
+        rows: the file of all cells' rows, if the batch has several tasks; else empty.
+    """
+
+    found: tuple[Any, ...]
+    rows: bytes = b""
+
+
+def batches(works: Iterable[Work], frames: Mapping[Input, int]) -> Iterator[Batch]:
+    """Small pieces of work together, a large one alone, those of a trace after one another.
 
     Args:
-        work: which.
-        share: how much a worker does in the whole study (see :func:`lae_sim._compiled.amount`).
+        works: descriptions, tasks and searches.
+        frames: world frames of each trace.
+    """
+    by_trace: dict[Input, list[Work]] = {}
+    for work in works:
+        by_trace.setdefault(_inputs(work)[0], []).append(work)
+    together: list[Work] = []
+    cost = 0
+    for work in chain.from_iterable(by_trace.values()):
+        own = frames[_inputs(work)[0]] * _times_scored(work)
+        if together and cost + own > BATCH:
+            yield Batch(tuple(together))
+            together, cost = [], 0
+        together.append(work)
+        cost += own
+    if together:
+        yield Batch(tuple(together))
 
-    Returns:
-        Of a description or a search its document, of a task the result or failure of each cell.
+
+def _times_scored(work: Work) -> int:
+    """How often the frames of its trace are scored, about."""
+    if isinstance(work, Task):
+        setting = work.cells[0].setting
+        return setting.count * (len(work.cells) + len(setting.world.sigmas) // 8)
+    return _TRIED * work.cell.setting.count if isinstance(work, Search) else 1
+
+
+def attempt_batch(batch: Batch, share: int = 0) -> Done:
+    """Do the pieces of a batch, on some worker.
+
+    Args:
+        batch: which.
+        share: how much a worker does in the whole study (see :func:`lae_sim._compiled.amount`).
     """
     expect(share)
+    tasks = [work for work in batch.works if isinstance(work, Task)]
+    shared = RowsFile() if len(tasks) > 1 else None
+    traces = _Traces()
+    found = tuple([attempt(work, traces, shared) for work in batch.works])
+    return Done(found, b"" if shared is None else shared.finish())
+
+
+class _Traces:
+    """The trace that was read last."""
+
+    def __init__(self) -> None:
+        self._key: object = None
+
+    def read(self, trace: Input, sequences: tuple[str, ...]) -> Trace:
+        """A trace, once for pieces of work that come one after another."""
+        if self._key != (trace, sequences):
+            self._trace = held(read_trace(trace.path, sequences or None))
+            self._key = trace, sequences
+        return self._trace
+
+
+def attempt(work: Work, traces: _Traces | None = None, shared: RowsFile | None = None) -> Any:
+    """Do a piece of work; what cannot be done is a :class:`Failure`.
+
+    Args:
+        work: what to do.
+        traces: what was read before, for pieces of work on the same trace.
+        shared: the file of the rows of several cells.
+
+    Returns:
+        Of a description or a search its document, of a task the result or failure of each cell, of
+        rivals their pairs.
+    """
     try:
         with explained("failed"):
             for trace in _inputs(work):
                 if stamp(trace.path) != trace.stamp and digest(trace.path) != trace.digest:
                     raise LaeError(f"{trace.path}: changed since the study began: run it again")
-            return _performed(work)
+            return _performed(work, traces or _Traces(), shared)
     except LaeError as error:
         return Failure(work_in_words(work), str(error))
 
 
-def _performed(work: Work) -> Any:
+def _performed(work: Work, traces: _Traces, shared: RowsFile | None) -> Any:
     if isinstance(work, Task):
-        return _cell_by_cell(work)
+        setting = work.cells[0].setting
+        return _cell_by_cell(work, traces.read(setting.trace, setting.sequences), shared)
     if isinstance(work, Search):
         return asdict(measured(work))
+    if isinstance(work, Rivals):
+        return work.pairs()
     from lae_sim.trace.describe import describe
-    from lae_sim.trace.file import read_trace
 
-    trace = read_trace(work.trace.path, work.sequences or None)
-    return describe(trace, work.trace.label)[0]
+    return describe(traces.read(work.trace, work.sequences), work.trace.label)[0]
 
 
-def _cell_by_cell(task: Task) -> list[Result | Failure]:
+def _cell_by_cell(task: Task, trace: Trace, shared: RowsFile | None) -> list[Result | Failure]:
     """The cells together; where that fails, each alone, so that one does not cost the others."""
+    before = 0 if shared is None else shared.rows
     try:
         with explained("failed"):
-            return list(compute(task))
+            return list(compute(task, trace, shared))
     except LaeError as error:
+        if shared is not None:
+            shared.undo(before)
         if len(task.cells) == 1:
             return [Failure(cell_in_words(task.cells[0]), str(error))]
     alone = [
         Task((cell,), {cell.forecaster: task.factories[cell.forecaster]}) for cell in task.cells
     ]
-    results = [result for one in alone for result in _cell_by_cell(one)]
+    results = [result for one in alone for result in _cell_by_cell(one, trace, shared)]
     reasons = {result.reason if isinstance(result, Failure) else "" for result in results}
     if len(reasons) == 1 and reasons != {""}:
         raise LaeError(*reasons)  # it lies with the replay
@@ -88,6 +187,8 @@ def _cell_by_cell(task: Task) -> list[Result | Failure]:
 
 
 def _inputs(work: Work) -> list[Input]:
+    if isinstance(work, Rivals):
+        return []
     if isinstance(work, Description):
         return [work.trace]
     return _setting(work).inputs
@@ -101,6 +202,8 @@ def work_in_words(work: Work) -> str:
     """What a piece of work is about, in words."""
     if isinstance(work, Description):
         return work.trace.label
+    if isinstance(work, Rivals):
+        return f"pairs of traces: {', '.join(work.setting.values())}"
     if isinstance(work, Search):
         cell = work.cell
         asked = ", ".join(f"{float(auc):g}" for auc in work.required)

@@ -134,8 +134,7 @@ class RowChecker:
 
     def _check_nulls(self, rows: Rows) -> None:
         for columns, null in ((TRUTH, rows.truth_null), (BOX, rows.box_null)):
-            differ = null[:, 1:] != null[:, :1]
-            if differ.any():
+            if null.any() and (differ := null[:, 1:] != null[:, :1]).any():
                 row = int(np.argmax(differ.any(axis=1)))
                 column = columns[int(np.argmax(null[row]))]
                 self._fail(rows, row, column, f"null, but not all of {', '.join(columns)} are")
@@ -212,10 +211,9 @@ class RowChecker:
         for columns, some in ((TRUTH, truth), (BOX, boxes)):
             if _move_like_corners(some, starts):
                 self._fail(rows, 0, columns[2], corners)
-        if _fit_as_corners(truth, boxes):
-            self._fail(rows, 0, "w", corners)
-        if _fit_as_corners(boxes, truth):
-            self._fail(rows, 0, "truth_w", corners)
+        column = _fit_as_corners(truth, boxes)
+        if column is not None:
+            self._fail(rows, 0, column, corners)
 
 
 def _cause_of_order(frame: int, expected: int) -> str:
@@ -244,11 +242,17 @@ def _move_like_corners(boxes: Floats, starts: Ints) -> bool:
     return bool(travel > 10 and np.nansum(np.abs(steps[:, 2:] - steps[:, :2])) < 0.8 * travel)
 
 
-def _fit_as_corners(truth: Floats, boxes: Floats) -> bool:
-    """Whether the boxes match the truth much better when read as corners."""
+def _fit_as_corners(truth: Floats, boxes: Floats) -> str | None:
+    """The column that makes boxes and truth match much worse than if it were that of corners."""
     known: Bools = ~np.isnan(truth[:, 0]) & ~np.isnan(boxes[:, 0])
     if not known.any():
-        return False
-    truth, boxes = truth[known], boxes[known]
-    sizes = np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
-    return bool(iou(truth, sizes).mean() > iou(truth, boxes).mean() + 0.3)
+        return None
+    truth, boxes = (np.asfortranarray(some[known]) for some in (truth, boxes))  # fast by columns
+    much_better = iou(truth, boxes).mean() + 0.3
+    if much_better >= 1:
+        return None
+    for column, corners, others in (("w", boxes, truth), ("truth_w", truth, boxes)):
+        sizes = np.column_stack([corners[:, :2], corners[:, 2:] - corners[:, :2]])
+        if iou(others, sizes).mean() > much_better:
+            return column
+    return None

@@ -374,8 +374,9 @@ class _StoredRecordings:
             if sum(group.num_rows for group in groups) != file.metadata.num_rows:
                 raise TraceError(f"{self.path}: the file is damaged: its row counts disagree")
             self._check_sizes(groups)
-            # twice, since row groups end with the sequence that fills them
-            batches = file.iter_batches(2 * BATCH_ROWS, columns=present, use_threads=False)
+            # twice, since row groups end with the sequence that fills them; memory is taken for all
+            rows = min(2 * BATCH_ROWS, max((group.num_rows for group in groups), default=1))
+            batches = file.iter_batches(max(rows, 1), columns=present, use_threads=False)
             for batch in batches:
                 if batch.num_rows:
                     yield Rows.of_batch(batch)

@@ -162,17 +162,27 @@ def _flags(values: npt.ArrayLike, what: str) -> Bools:
 
 BATCH_ROWS = 1 << 15
 
+BESIDE = 64
+"""World frames that take as much memory as what is known of a sequence beside its frames."""
 
 Item = TypeVar("Item", bound=Sized)
 
 
-def batched(items: Iterable[Item], frames: int = BATCH_ROWS) -> Iterator[list[Item]]:
-    """Recordings or runs in groups of about ``frames`` world frames together."""
+def batched(
+    items: Iterable[Item], frames: int = BATCH_ROWS, beside: int = 0
+) -> Iterator[list[Item]]:
+    """Recordings or runs in groups of about ``frames`` world frames together.
+
+    Args:
+        items: what is grouped.
+        frames: how many world frames fill a group.
+        beside: how many each item counts for, beside its own.
+    """
     group: list[Item] = []
     pending = 0
     for item in items:
         group.append(item)
-        pending += len(item)
+        pending += len(item) + beside
         if pending >= frames:
             yield group
             group, pending = [], 0

@@ -18,7 +18,7 @@ from places import REPOSITORY
 
 import lae_sim
 from lae_sim.cli import replay as replay_command
-from lae_sim.engine import scheduler
+from lae_sim.engine import lanes
 from lae_sim.engine.policies import every, fifo, shrinking_tail, vot_realtime
 from lae_sim.evaluation import pairing
 from lae_sim.evaluation.evaluate import evaluate_runs
@@ -581,7 +581,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     tmp_path, monkeypatch, capsys
 ):
     calls = Counter()
-    for function in (scheduler.simulate, pairing.pair, base.forecast):
+    for function in (lanes.simulate_lanes, pairing.pair, base.forecast):
         name = function.__name__
 
         def counted(*arguments, _function=function, _name=name, **named):
@@ -595,8 +595,8 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     asked += ["--search", "off"]
     assert replay_command.main(asked) == 0
     plain, alone = capsys.readouterr().out, calls.copy()
-    # one group of sequences: a pairing for each cost, and each forecaster once
-    assert alone == {"simulate": 8, "pair": 2, "forecast": 2}
+    # one group of sequences: one schedule, a pairing for each cost, and each forecaster once
+    assert alone == {"simulate_lanes": 1, "pair": 2, "forecast": 2}
     calls.clear()
     files = {
         "--plot": "plot.svg",
@@ -615,7 +615,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     calls.clear()
     timeline = ["--timeline", str(tmp_path / "timeline.svg"), "--search", "off"]
     assert replay_command.main([str(SLOW), *timeline]) == 0
-    assert calls == {"simulate": 8, "pair": 1, "forecast": 2}
+    assert calls == {"simulate_lanes": 1, "pair": 1, "forecast": 2}
 
 
 def test_a_fast_tracker_is_told_of_the_floor_of_one_frame():

@@ -32,6 +32,8 @@ from lae_sim.learning.trainers import KalmanTrainer
 from lae_sim.replay.latency import bootstrap, by_frame, constant, scaled
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study import rows as cell_rows
+from lae_sim.study.comparisons import Rivals
+from lae_sim.study.pairs import Pairs
 from lae_sim.study.run import StudyResults, compute_study, flat_rows
 from lae_sim.study.spec import Study
 
@@ -541,6 +543,13 @@ def test_what_the_means_rest_on_is_said(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------ resuming
 
 
+@pytest.fixture
+def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each piece of work by itself, and each cell in a file of its own, as if they were large."""
+    monkeypatch.setattr("lae_sim.study.work.BATCH", 1)
+
+
+@pytest.mark.usefixtures("one_by_one")
 def test_only_what_is_missing_or_changed_is_computed(tmp_path: Path) -> None:
     mine = tmp_path / "mine.parquet"
     shutil.copy(SLOW, mine)
@@ -569,6 +578,90 @@ def test_only_what_is_missing_or_changed_is_computed(tmp_path: Path) -> None:
     rows = {(row["trace"], row["forecaster"]): row["auc"] for row in flat_rows(first.summary)}
     again = {(r["trace"], r["forecaster"]): r["auc"] for r in flat_rows(run(out, study).summary)}
     assert again["mine", "hold"] == rows["synthetic-fast", "hold"] != rows["mine", "hold"]
+
+
+def test_small_cells_share_files_that_are_divided_when_a_study_wants_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scales = tuple(map(Fraction, (1, 2, 3)))
+    whole = Study((str(SLOW), str(FAST)), sequences=FEW, scales=scales)
+    part = Study((str(FAST),), sequences=FEW, scales=scales[1:])
+    out, alone = tmp_path / "out", tmp_path / "alone"
+    assert run(out, whole).computed == 12
+    assert len(list((out / "results").iterdir())) == 1
+    kept = run(out, part)
+    assert kept.computed == 0
+    table = pd.read_parquet(out / "results")
+    assert set(table["scale"]) == {"2", "3"}
+    assert len(list((out / "results").iterdir())) == len(list((out / "unused").iterdir())) == 1
+    with monkeypatch.context() as patched:
+        patched.setattr("lae_sim.study.work.BATCH", 1)
+        fresh = run(alone, part)
+        assert len(list((alone / "results").iterdir())) == 4
+    assert (fresh.summary, fresh.comparisons) == (kept.summary, kept.comparisons)
+    pd.testing.assert_frame_equal(fresh.to_frame(), kept.to_frame())
+    again = run(out, whole)
+    assert again.computed == 0
+    assert len(again.to_frame()) == 12 * len(FEW)
+    assert not list((out / "unused").iterdir())
+
+
+def test_what_was_computed_before_a_cell_failed_is_not_kept_twice(tmp_path: Path) -> None:
+    (tmp_path / "confused_of_study.py").write_text(OWN)
+    path = toml(
+        tmp_path, forecasters=["confused_of_study:Confused"], conventions=["pysot", "otb"],
+        scales=[1, 2],
+    )  # fmt: skip
+    study_command(path, "--no-report", "--out", tmp_path / "out", cwd=tmp_path, status=1)
+    table = pd.read_parquet(tmp_path / "out" / "results")
+    assert len(list((tmp_path / "out" / "results").iterdir())) == 1
+    assert set(table["forecaster"]) == {"hold"}
+    assert not table.duplicated(["trace", "scale", "convention", "sequence"]).any()
+
+
+def test_pairs_are_kept_and_only_those_of_others_are_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = Study((str(SLOW), str(FAST)), sequences=FEW)
+    first = run(tmp_path, study)
+    before = contents(tmp_path)
+    compared: list[str] = []
+    pairs = Rivals.pairs
+
+    def counted(rivals: Rivals) -> Pairs:
+        compared.append(rivals.setting["forecaster"])
+        return pairs(rivals)
+
+    monkeypatch.setattr(Rivals, "pairs", counted)
+    again = run(tmp_path, study)
+    assert (compared, again.comparisons, contents(tmp_path)) == ([], first.comparisons, before)
+    more = Study((str(SLOW), str(FAST)), sequences=FEW, forecasters=("constant-velocity", "kalman"))
+    assert len(run(tmp_path, more).comparisons) == 3
+    assert compared == ["constant-velocity"]
+    table = pd.read_parquet(tmp_path / "comparisons.parquet")
+    csv = pd.read_csv(tmp_path / "comparisons.csv", dtype={"fps": str, "scale": str, "sigma": str})
+    pd.testing.assert_frame_equal(table[csv.columns], csv, check_dtype=False)
+    with open(tmp_path / "comparisons.parquet", "ab") as file:
+        file.write(b"cut")
+    compared.clear()
+    run(tmp_path, more)
+    assert compared == ["hold", "constant-velocity", "kalman"]
+
+
+def test_of_many_pairs_those_with_the_best_are_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b", "c"):
+        shutil.copy(SLOW if name == "b" else FAST, tmp_path / f"{name}.parquet")
+    study = Study((str(tmp_path / "*.parquet"),), sequences=FEW, forecasters=("hold",))
+    whole = run(tmp_path / "out", study)
+    assert [(pair.a, pair.b) for pair in whole.comparisons] == [("a", "b"), ("a", "c"), ("b", "c")]
+    monkeypatch.setattr("lae_sim.study.comparisons.MOST", 2)
+    some = run(tmp_path / "out", study)
+    best = max(some.summary, key=lambda row: row.scores["auc"]).run
+    assert some.pairs == whole.pairs == 3
+    assert some.comparisons == tuple(p for p in whole.comparisons if best in (p.a, p.b))
+    assert len(pd.read_parquet(tmp_path / "out" / "comparisons.parquet")) == 3
 
 
 @pytest.mark.parametrize(
@@ -632,7 +725,8 @@ def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
         while len(list(out.glob("results/[!.]*.parquet"))) < 3 and time.monotonic() < deadline:
             time.sleep(0.005)
         process.send_signal(signal.SIGKILL)
-    done = len(list(out.glob("results/[!.]*.parquet")))
+    names = ["trace", "latency", "scale", "forecaster"]
+    done = len(pd.read_parquet(out / "results")[names].drop_duplicates())
     assert 3 <= done < 64
     told = study_command(*asked[6:], cwd=tmp_path)
     assert f"64 cells, {64 - done} of them computed now" in told
@@ -738,7 +832,7 @@ def test_an_own_policy_is_replayed_in_simpy_which_is_said(
 
 def test_a_worker_that_dies_is_told_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "deadly_of_study.py").write_text(OWN)
-    path = toml(tmp_path, forecasters=["deadly_of_study:Deadly"], scales=[1, 2])
+    path = toml(tmp_path, forecasters=["deadly_of_study:Deadly"], scales=[*range(1, 31)])
     told = study_command(path, "--workers", 2, cwd=tmp_path, status=2)
     assert "a worker died" in told
     assert "the same command goes on from there" in told
@@ -760,6 +854,7 @@ def test_a_forecaster_that_fails_costs_itself_alone(tmp_path: Path) -> None:
             assert "ZeroDivisionError: of my own" in failure["reason"]
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_a_trace_that_changes_meanwhile_is_not_taken_for_what_it_was(tmp_path: Path) -> None:
     mine = tmp_path / "mine.parquet"
     shutil.copy(FAST, mine)
@@ -835,7 +930,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a study of four cells."""
+    """The folder of a study of four cells, which are in one file."""
     folder = tmp_path_factory.mktemp("finished")
     run(folder)
     return folder
@@ -873,8 +968,10 @@ def test_what_is_not_as_it_was_written_is_computed_again(
     assert contents(folder) == whole
 
 
-def test_a_cell_that_is_cut_off_is_computed_again(finished: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(finished, tmp_path / "study"))
+@pytest.mark.usefixtures("one_by_one")
+def test_a_cell_that_is_cut_off_is_computed_again(tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    run(folder)
     (folder / "results" / "notes.txt").write_text("foreign")
     (folder / "about" / "mine").mkdir()
     whole = contents(folder)

@@ -17,8 +17,10 @@ from lae_sim.comparison.statistics import (
     Recovered,
     by_attribute,
     holm,
+    quantiles,
     recovered,
     signed_rank_p,
+    signed_rank_ps,
     summarise,
 )
 from lae_sim.errors import LaeError
@@ -394,3 +396,29 @@ def test_a_difference_is_paired():
     alike = bootstrap.compare(values - baseline, 0.0, margins, 0.0)
     assert (alike.p, alike.better, alike.worse) == (found.p, found.better, found.worse)
     assert alike.interval.low == pytest.approx(found.interval.low, abs=1e-12)
+
+
+def test_rows_of_differences_have_the_p_that_each_has_alone():
+    rng = np.random.default_rng(5)
+    for size in (1, 2, 8, 49, 50, 51, 123):
+        for decimals in (1, 12):  # many ties and zeros, and none
+            rows = np.round(rng.normal(0, 0.3, (20, size)), decimals)
+            rows[0] = 0
+            assert signed_rank_ps(rows) == [signed_rank_p(row) for row in rows]
+            assert signed_rank_ps(-rows) == signed_rank_ps(rows)
+            assert signed_rank_p(rows[0]) == 1
+
+
+def test_quantiles_are_those_of_numpy_to_the_bit():
+    rng = np.random.default_rng(6)
+    for size in (1, 2, 3, 41, 450, 10_000):
+        for values in (
+            *(np.round(rng.normal(size=size), decimals) for decimals in (0, 3, 17)),
+            rng.lognormal(0, 2, size),
+            -rng.lognormal(0, 2, size),
+            np.zeros(size),
+        ):
+            for at in ((0.025, 0.975), (0, 1), (0.3, 0.5), (0.49, 0.98), (0.005, 0.995)):
+                expected = tuple(np.quantile(values, at).tolist())
+                assert quantiles(values, at) == expected
+                assert quantiles(values, at, -0.3, 0.5) == expected  # whatever is guessed

@@ -303,11 +303,10 @@ def test_many_sequences_are_replayed_as_each_by_itself() -> None:
         else replace(whole, name=f"s{k}")
         for k in range(9)
     ]
-    trace = trace_of(*some)
-    for one, other in zip(
-        lae_sim.replay_trace(trace, batch=True), lae_sim.replay_trace(trace, batch=False)
-    ):
-        assert one.schedule.ready.tolist() == other.schedule.ready.tolist()
+    runs = lae_sim.replay_trace(trace_of(*some))
+    for run, recording in zip(runs, some):
+        alone = lae_sim.replay_sequence(recording, runs.clock)
+        assert run.schedule.ready.tolist() == alone.schedule.ready.tolist()
 
 
 def test_instants_beyond_64_bits_name_the_sequence() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
@@ -13,7 +13,7 @@ from witness import moving
 from lae_sim.engine import lanes as batch
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import every, latest, vot_realtime
-from lae_sim.engine.scheduler import Call, Policy
+from lae_sim.engine.scheduler import Call, Policy, Service
 from lae_sim.errors import LaeError
 from lae_sim.replay import run
 from lae_sim.replay.latency import (
@@ -26,7 +26,7 @@ from lae_sim.replay.latency import (
     resampled,
     scaled,
 )
-from lae_sim.replay.run import Run, replay_repeated
+from lae_sim.replay.run import Run, Runs, replay_repeated, replay_sequence
 from lae_sim.replay.world import replay_trace
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
@@ -75,23 +75,45 @@ def test_a_batch_gives_the_same_runs(source: LatencySource, policy: Policy) -> N
         "kind": "every-frame", "stride": "2"}}), SLOWER.recordings)  # fmt: skip
     assert half.metadata.stride == 2
     for options in ({}, {"timing": SLOWER}, {"passes": [half]}, {"fps": Fraction(30000, 1001)}):
-        alone = replay_trace(TRACE, latency=source, policy=policy, **options)  # type: ignore[arg-type]
-        together = replay_trace(TRACE, latency=source, policy=policy, batch=True, **options)  # type: ignore[arg-type]
-        assert [fields(r) for r in together] == [fields(r) for r in alone]
+        runs = replay_trace(TRACE, latency=source, policy=policy, **options)  # type: ignore[arg-type]
+        assert [fields(r) for r in runs] == [fields(r) for r in in_simpy(runs)]
+
+
+def in_simpy(runs: Runs) -> Iterator[Run]:
+    """The same runs, each sequence alone in the SimPy engine."""
+    for recording in runs.trace:
+        strided = {other.metadata.stride: other[recording.name] for other in runs.strided}
+        times = None if runs.timing is None else runs.timing[recording.name]
+        yield replay_sequence(
+            recording, runs.clock, runs.source, runs.policy, times, strided=strided
+        )
 
 
 @pytest.mark.usefixtures("groups")
 def test_a_batch_fails_where_its_runs_do() -> None:
     for policy, timing in ((backwards_at_40, None), (latest, gappy())):
         outcomes = []
-        for together in (False, True):
+        runs = replay_trace(TRACE, policy=policy, timing=timing)
+        for made in (runs, in_simpy(runs)):
             names: list[str] = []
-            runs = replay_trace(TRACE, policy=policy, timing=timing, batch=together)
             with pytest.raises(LaeError) as error:
-                names.extend(found.recording.name for found in runs)
+                names.extend(found.recording.name for found in made)
             outcomes.append((names, str(error.value)))
         assert outcomes[0] == outcomes[1]
         assert outcomes[0][0]
+
+
+@pytest.mark.parametrize("policy", [latest, vot_realtime()])
+def test_a_users_own_source_and_policy_see_one_sequence_after_another(policy: Policy) -> None:
+    asked: list[str] = []
+
+    def source(recording: Recording) -> Service:
+        asked.append(recording.name)
+        return by_frame(recording) if policy is not latest else by_frame(recording).__call__
+
+    for found in replay_trace(TRACE, policy=policy, latency=source):
+        assert asked[-1] == found.recording.name
+    assert asked == NAMES
 
 
 def gappy() -> Trace:

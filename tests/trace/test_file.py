@@ -201,7 +201,7 @@ def test_a_stream_may_not_have_a_column_that_was_not_foreseen(
 ) -> None:
     group = [sparse(9, i, f"s{i}") for i in range(4)]
     group[2] = flagged(group[2])
-    monkeypatch.setattr(lae_sim.trace.recording.batched, "__defaults__", (10,))
+    monkeypatch.setattr(lae_sim.trace.recording.batched, "__defaults__", (10, 0))
     with pytest.raises(TraceError, match=r"sequence 's2' has visible, which the first ones lack"):
         write_trace(Trace(EVERY, iter(group)), path)
     assert not path.exists()
