@@ -62,7 +62,6 @@ function choosable(table) {
       groups[g].hidden = !span;
       groups[g].colSpan = span || 1;
     });
-    edges(table.closest(".scroll"));
   };
   const labels = heads.map((head, column) => made("label", { title: head.title }, boxes[column],
     ` ${above[column] ? above[column] + " " : ""}${head.textContent}`));
@@ -70,11 +69,15 @@ function choosable(table) {
   const count = () => {
     summary.textContent = `Columns: ${boxes.filter(box => box.checked).length} of ${boxes.length}`;
   };
-  boxes.forEach((box, column) => box.addEventListener("change", () => { show([column]); count(); }));
+  const choose = columns => {
+    show(columns);
+    count();
+    edges(table.closest(".scroll"));
+  };
+  boxes.forEach((box, column) => box.addEventListener("change", () => choose([column])));
   all.addEventListener("click", () => {
     for (const box of boxes) box.checked = true;
-    show([...boxes.keys()]);
-    count();
+    choose([...boxes.keys()]);
   });
   const chooser = made("details", { className: "columns" }, summary,
     made("fieldset", { ariaLabel: "Columns of the table" }, ...labels), all);
@@ -86,10 +89,13 @@ function choosable(table) {
 /* Mark the edges of a table beyond which there is more of it. */
 function edges(scroller) {
   const wide = scroller.parentElement, first = scroller.querySelector("tbody th");
+  const caption = scroller.querySelector("caption");
   const left = scroller.scrollLeft, more = scroller.scrollWidth - scroller.clientWidth - left;
   wide.classList.toggle("before", left > 1);
   wide.classList.toggle("after", more > 1);
   if (first) wide.style.setProperty("--first", `${first.offsetWidth + 1}px`);
+  const top = caption ? caption.offsetHeight - scroller.scrollTop : 0;
+  wide.style.setProperty("--top", `${Math.max(top, 0) + 1}px`);
 }
 
 function saved(file, name) {
