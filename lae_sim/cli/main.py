@@ -28,6 +28,7 @@ COMMANDS = {
 
 EXTRAS = {
     "torch": "torch",
+    "fast": "numba",
     "film": "av",
     "trax": "vot-trax",
     "mat73": "h5py",

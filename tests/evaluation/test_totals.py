@@ -19,7 +19,7 @@ from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.replay.run import Run, replay_sequence
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.trace.metadata import Metadata
-from lae_sim.trace.recording import Recording
+from lae_sim.trace.recording import BESIDE, Recording
 
 CLOCK = Clock.at(Fraction(30))
 EVERY = Metadata.new("30", "every-frame")
@@ -123,7 +123,7 @@ def test_what_is_kept_of_a_sequence_does_not_grow_with_sigmas_or_thresholds() ->
 
     totals = Totals(hold=1)
     tracemalloc.start()
-    for part in evaluate_groups(runs(), EVERY, FORECASTERS, SIGMA_GRID, frames=1500):
+    for part in evaluate_groups(runs(), EVERY, FORECASTERS, SIGMA_GRID, frames=500 * (3 + BESIDE)):
         totals.add(part)
     del part
     kept, _ = tracemalloc.get_traced_memory()
