@@ -194,7 +194,7 @@ def test_outputs_say_when_frames_came(
 
     text = f'traces = "{path.as_posix()}"\nforecasters = "hold"\n'
     (tmp_path / "s.toml").write_text(text + "fps = [30, 60]\n")
-    quick = ["--workers", "1", "--no-report"]
+    quick = ["--workers", "1", "--no-report", "--out", str(tmp_path / "results")]
     assert study.main([str(tmp_path / "s.toml"), *quick]) == 2
     assert "fps: " in (said := capsys.readouterr().err)
     assert "forget_arrivals = true" in said
@@ -223,7 +223,8 @@ def test_a_study_counts_ages_by_arrivals(
     text = f'traces = "{path.as_posix()}"\nforecasters = "hold"\nlatencies = "constant:47ms"\n'
     (tmp_path / "s.toml").write_text(text)
     capsys.readouterr()
-    assert study.main([str(tmp_path / "s.toml"), "--workers", "1", "--no-report", "--json"]) == 0
+    quick = ["--workers", "1", "--no-report", "--out", str(tmp_path / "results"), "--json"]
+    assert study.main([str(tmp_path / "s.toml"), *quick]) == 0
     (row,) = json.loads(capsys.readouterr().out)["summary"]
     assert replay.main([str(path), "--latency", "constant:47ms", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)["traces"][0]["results"][0]
