@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from moving import cv2, moving, straight
-from places import REPOSITORY, TRACES
+from places import TRACES, benchmark
 
 import lae_sim
 from lae_sim import Metadata, Recording, Trace
@@ -22,14 +21,7 @@ SLOW = TRACES / "synthetic-slow.parquet"
 
 @pytest.fixture(scope="module")
 def figures() -> ModuleType:
-    path = REPOSITORY / "benchmarks" / "forecasters.py"
-    spec = importlib.util.spec_from_file_location("forecaster_figures", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["forecaster_figures"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    return benchmark("forecasters")
 
 
 @pytest.fixture(scope="module")

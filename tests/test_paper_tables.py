@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -11,21 +10,14 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from places import REPOSITORY, TRACES
+from places import TRACES, benchmark
 
 import lae_sim
 
 
 @pytest.fixture(scope="module")
 def paper() -> ModuleType:
-    path = REPOSITORY / "benchmarks" / "paper_tables.py"
-    spec = importlib.util.spec_from_file_location("paper_tables", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["paper_tables"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    return benchmark("paper_tables")
 
 
 @pytest.fixture

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import pytest
-from places import REPOSITORY
+from places import benchmark
 
-SPEC = importlib.util.spec_from_file_location("publish", REPOSITORY / "benchmarks" / "publish.py")
-assert SPEC is not None
-assert SPEC.loader is not None
-publish = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(publish)
+publish = benchmark("publish")
 
 
 def test_the_page_has_a_place_for_each(tmp_path: Path) -> None:

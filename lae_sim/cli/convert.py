@@ -9,7 +9,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lae_sim.cli.options import add_frame_times, argument, exit_status, new_parser, print_json
+from lae_sim.cli.options import (
+    add_force,
+    add_frame_times,
+    argument,
+    exit_status,
+    new_parser,
+    print_json,
+)
 from lae_sim.errors import LaeError, install, listed
 from lae_sim.files import check_distinct, check_places
 from lae_sim.progress import ProgressBar, print_text
@@ -93,11 +100,7 @@ def parser() -> argparse.ArgumentParser:
     add("--skip-missing", action="store_true", help="leave out results without ground truth")
     add_frame_times(add)
     add("--image-size", type=argument(_size), metavar="WxH", help="image size, such as 1280x720")
-    add(
-        "--force",
-        action="store_true",
-        help="replace a trace of another tracker or dataset, or what is no trace",
-    )
+    add_force(add)
     add("--json", action="store_true", help="print the summary as JSON")
     return made
 

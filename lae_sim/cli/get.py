@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.cli.options import exit_status, new_parser, print_json
+from lae_sim.cli.options import add_force, exit_status, new_parser, print_json
 from lae_sim.errors import LaeError, listed
 from lae_sim.files import check_distinct, check_places
 from lae_sim.progress import ProgressBar, print_text, tell
@@ -70,11 +70,7 @@ def parser() -> argparse.ArgumentParser:
         help="write nothing, but make the traces and compare their scores with those stated; of "
         "all recipes if none is named",
     )
-    add(
-        "--force",
-        action="store_true",
-        help="replace a trace of another tracker or dataset, or what is no trace",
-    )
+    add_force(add)
     add("--json", action="store_true", help="print JSON")
     return made
 

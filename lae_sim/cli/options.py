@@ -62,6 +62,15 @@ def add_frame_times(add: Callable[..., argparse.Action]) -> None:
     )
 
 
+def add_force(add: Callable[..., argparse.Action]) -> None:
+    """Add that a trace may replace what is there, by what adds to a parser or a group."""
+    add(
+        "--force",
+        action="store_true",
+        help="replace a trace of another tracker or dataset, or what is no trace",
+    )
+
+
 def add_passes(add: Callable[..., argparse.Action]) -> None:
     """Add further passes of the tracker, by what adds to a parser or a group."""
     add(

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lae_sim.cli.options import (
+    add_force,
     add_frame_times,
     argument,
     exit_status,
@@ -170,11 +171,7 @@ def parser() -> argparse.ArgumentParser:
     add = group.add_argument
     add("--out", metavar="TRACE", help="the trace (default: TRACKER-DATASET.parquet)")
     add("--resume", action="store_true", help="go on with a profile that was interrupted")
-    add(
-        "--force",
-        action="store_true",
-        help="replace a trace of another tracker or dataset, or what is no trace",
-    )
+    add_force(add)
     add("--json", action="store_true", help="print what was written as JSON")
     return made
 

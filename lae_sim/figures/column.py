@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLUMN, PAGE = 3.4, 7.0
-"""Inches: what fits a column, and both columns, of the usual two-column papers."""
+COLUMN = 3.4
+"""Inches: what fits a column of the usual two-column papers."""
 
 KINDS = ("pdf", "svg")
 _LEGEND_ROW, _CHARACTER = 0.135, 0.058  # inches that a row and a letter of a legend take

@@ -68,24 +68,6 @@ def run_here(
         yield item, work(item)
 
 
-def run_all(
-    work: Callable[[Item], Any], items: Iterable[Item], workers: int, scheduler: str | None = None
-) -> Generator[tuple[Item, Any], None, None]:
-    """Each item with what a function makes of it, as they are finished; to be closed.
-
-    Args:
-        work: a function of a module, that workers can import.
-        items: handed out as workers become free.
-        workers, scheduler: see :func:`at_work`.
-
-    Raises:
-        LaeError: if a worker died, and nobody takes its place; if there is no such cluster, or
-            Dask is not installed.
-    """
-    with at_work(workers, scheduler) as run:
-        yield from run(work, items)
-
-
 def _handed_out(
     work: Callable[[Item], Any],
     items: Iterable[Item],

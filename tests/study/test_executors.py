@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future
 from types import ModuleType
 from typing import Any
@@ -13,7 +13,14 @@ from typing import Any
 import pytest
 
 from lae_sim.errors import LaeError
-from lae_sim.study.executors import run_all
+from lae_sim.study.executors import at_work
+
+
+def run_all(
+    work: Callable[[Any], Any], items: Iterable[Any], workers: int, scheduler: str | None = None
+) -> Generator[tuple[Any, Any], None, None]:
+    with at_work(workers, scheduler) as run:
+        yield from run(work, items)
 
 
 def test_an_end_does_not_wait_for_what_workers_are_doing(
