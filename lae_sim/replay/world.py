@@ -450,7 +450,7 @@ def parse_latency(text: str) -> LatencySource:
     if text == "by-call":
         return sources.by_call
     if name == "stage":
-        return sources.StageTimes(tuple(value.split("+")))
+        return named(f"latency {shown(text)}", _stages, value)
     if name == "constant":
         return sources.constant(value)
     if name == "resample":
@@ -472,6 +472,10 @@ def parse_latency(text: str) -> LatencySource:
         "constant:47ms, resample:SEED, lognormal:SEED, bootstrap:SEED[:BLOCK], "
         f"package.module:object, all of them perhaps with ,init=TIME{meant}"
     )
+
+
+def _stages(value: str) -> sources.StageTimes:
+    return sources.StageTimes(tuple(value.split("+")))
 
 
 def parse_sigmas(value: Number | Iterable[Number]) -> tuple[Fraction, ...]:

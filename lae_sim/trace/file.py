@@ -91,13 +91,6 @@ class Trace:
         return tuple(recording.name for recording in self.recordings)
 
     @property
-    def stages(self) -> list[str]:
-        """The stages of which it may say how long they took, in their order; of a file or list."""
-        known = self.recordings if isinstance(self.recordings, Sequence) else ()
-        columns = self.columns.union(*(recording.columns for recording in known))
-        return in_order(stage for column in columns if (stage := stage_of(column)))
-
-    @property
     def has_arrivals(self) -> bool:
         """Whether it says when each frame arrived."""
         known = self.recordings if isinstance(self.recordings, Sequence) else ()
