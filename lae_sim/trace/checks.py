@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable
 from typing import Any, NoReturn
@@ -57,9 +58,9 @@ def _stage_types(columns: Iterable[str], where: str) -> dict[str, str]:
     """The types of those columns that have the times of stages."""
     types = {}
     for column in columns:
-        if column.startswith("stage_") and column.endswith("_ns"):
+        if found := re.fullmatch("stage_(.*)_ns", column):
             try:
-                types[stage_column(column[len("stage_") : -len("_ns")])] = "int64"
+                types[stage_column(found[1])] = "int64"
             except LaeError as error:
                 raise TraceError(f"{where}: column {column!r:.100}: {error}") from error
     return types
