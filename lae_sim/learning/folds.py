@@ -23,7 +23,7 @@ from lae_sim.forecast.base import (
     factory_for,
     notes_of,
 )
-from lae_sim.replay.run import Run
+from lae_sim.replay.run import Run, RunBatch
 from lae_sim.replay.world import World
 from lae_sim.trace.file import Trace
 
@@ -52,10 +52,11 @@ class Examples:
     @classmethod
     def of(cls, runs: Sequence[Run]) -> Examples:
         """The examples of some runs of one trace."""
-        pairing = pair([run.schedule for run in runs], [Fraction(0)])
+        batch = RunBatch.of(runs)
+        pairing = pair(batch.schedules, [Fraction(0)])
         fed = histories(pairing)
         queries = pairs(pairing, fed)
-        lanes = lanes_of(runs, pairing, fed, [None] * len(runs))
+        lanes = lanes_of(batch, pairing, fed, None)
         ends = np.cumsum(pairing.lengths)
         sequence = fed.sequence.take(lanes.lane(queries.item))
         row = (ends - pairing.lengths)[sequence] + queries.frame
