@@ -40,9 +40,7 @@ def replaced(page: str, pattern: str, text: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument(
-        "--measured", type=Path, metavar="FILE", help="what bench.py --json printed"
-    )
+    parser.add_argument("--measured", type=Path, metavar="FILE", help="of bench.py --json")
     file = parser.parse_args().measured
     found = Report.read(file.read_text(encoding="utf-8")) if file else report(quick=False)
     PAGE.write_text(published(PAGE.read_text(encoding="utf-8"), found), encoding="utf-8")

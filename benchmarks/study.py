@@ -326,7 +326,7 @@ def lane_lines(rounds: int) -> list[Line]:
         "schedule alone, compiled": "schedule",
         "and scores, hold, compiled": "scores",
     }
-    found = [
+    return [
         Line(
             [f"random latencies, {len(every):,} lanes", name, f"{rate:.2f} M frames/s"]
             + [f"{rate / speed['SimPy, schedule alone']:.1f} x SimPy"],
@@ -334,7 +334,6 @@ def lane_lines(rounds: int) -> list[Line]:
         )
         for name, rate in speed.items()
     ]
-    return found
 
 
 def measured(folder: Path, quick: bool) -> Iterator[list[Line]]:
