@@ -1,13 +1,13 @@
 """Other programs that run while a tracker is measured, as they will in use.
 
-Each is a command of the shell in a session of its own. A second small process waits for the end of
-a pipe that only this process holds open: when this one closes it, or ends however it ends, the
-command and all that it started are ended too, but for what has begun yet another session.
+Each is a command of the shell in a session of its own. A second small process, its guard, waits for
+the end of a pipe that only this process holds open: when this one closes it, or ends however it
+ends, the command and all that it started are ended too, but for what has begun yet another session.
+The command waits for its guard: no moment is left in which Ctrl-C could part them.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -32,6 +32,7 @@ KEPT_BYTES = 1_000_000
 LAST_WORDS = 1_000
 """Bytes of what it printed in which to look for why it failed."""
 
+_WAITS = 'read go || exit; exec /bin/sh -c "$1" </dev/null'
 _GUARD = f"""\
 cat >/dev/null
 kill -TERM -"$1" || exit 0
@@ -42,7 +43,7 @@ kill -KILL -"$1"
 
 @dataclass
 class _Load:
-    """A command that runs, and what ends it."""
+    """A command, and what ends it."""
 
     command: str
     process: subprocess.Popen[bytes]
@@ -78,7 +79,10 @@ class Loads:
     def __enter__(self) -> Loads:
         try:
             for command in self._commands:
-                self._loads.append(_started(command))
+                load = _made(command)
+                self._loads.append(load)
+                _pipe(load.process).write(b"go\n")
+                _pipe(load.process).close()
             if self._commands:
                 self._check_started()
         except BaseException:
@@ -147,7 +151,7 @@ class Loads:
         """End all that runs; twice does no harm."""
         self._over = True
         for load in self._loads:  # all of them first: a second Ctrl-C cannot stop the guards
-            _pipe(load).close()
+            _pipe(load.guard).close()
         for load in self._loads:
             while load.guard.poll() is None:
                 load.process.poll()  # as long as nobody has, it counts as there
@@ -171,39 +175,25 @@ def in_all(parts: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]
     return found
 
 
-def _started(command: str) -> _Load:
-    """A command of the shell, begun, and its guard."""
+def _made(command: str) -> _Load:
+    """A command of the shell, which waits for a line, and its guard."""
+    apart: dict[str, Any] = {"stdin": subprocess.PIPE, "bufsize": 0, "start_new_session": True}
     printed = tempfile.TemporaryFile("a+b", buffering=0)  # noqa: SIM115
     try:
-        process = subprocess.Popen(
-            ["/bin/sh", "-c", command],
-            stdin=subprocess.DEVNULL,
-            stdout=printed,
-            stderr=printed,
-            start_new_session=True,  # Ctrl-C is for this process alone
-        )
+        words = ["/bin/sh", "-c", _WAITS, "load", command]
+        process = subprocess.Popen(words, stdout=printed, stderr=printed, **apart)
+        words = ["/bin/sh", "-c", _GUARD, "guard", str(process.pid)]
+        nowhere = subprocess.DEVNULL
+        guard = subprocess.Popen(words, stdout=nowhere, stderr=nowhere, **apart)
     except (OSError, ValueError) as error:
         raise LaeError(f"beside {shown(command)}: does not start: {error}") from error
-    try:
-        guard = subprocess.Popen(
-            ["/bin/sh", "-c", _GUARD, "guard", str(process.pid)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-    except BaseException:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        raise
     return _Load(command, process, guard, printed, time.monotonic())
 
 
-def _pipe(load: _Load) -> IO[bytes]:
-    """The pipe whose end ends the load."""
-    assert load.guard.stdin is not None
-    return load.guard.stdin
+def _pipe(process: subprocess.Popen[bytes]) -> IO[bytes]:
+    """The pipe that a process reads."""
+    assert process.stdin is not None
+    return process.stdin
 
 
 def _how(code: int) -> str:
