@@ -305,11 +305,11 @@ def _run(
     asked = searches(plan.cells, study.require_auc) if study.require_auc else []
     described = [Description(source.input, study.sequences) for source in plan.sources]
     cells = [cell for cell in plan.cells if not store.has(cell)]
-    sought = [search for search in asked if store.document(search.key) is None]
+    sought = [search for search in asked if not store.holds(search.key)]
     needed = {*(cell.forecaster for cell in cells), *(each.cell.forecaster for each in sought)}
     factories, training = _factories(plan, needed, store, lambda what: progress(what, 0, 1))
     works: list[Work] = [
-        *(each for each in described if store.document(each.key) is None),
+        *(each for each in described if not store.holds(each.key)),
         *tasks(cells, factories),
         *(replace(search, factory=factories[search.cell.forecaster]) for search in sought),
     ]

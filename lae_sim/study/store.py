@@ -20,7 +20,9 @@ from lae_sim.study.cells import Cell, Result
 from lae_sim.study.rows import RowsFile, read_rows
 
 _FILES = "[0-9a-f]" * 32 + ".parquet"
-_BYTES, _DIGEST = "rows_bytes", "sha256"  # what the files say of themselves
+_BYTES = "rows_bytes"  # what a file of details says of that of rows
+_DIGEST = '{"sha256": "'  # how a file of details begins: with a digest of what follows
+_AFTER = len(_DIGEST) + 32
 
 
 @dataclass(frozen=True)
@@ -32,19 +34,18 @@ class Part:
         size: of the file of rows, bytes.
         cells: by key what is known of each cell beside its rows (see :class:`Result`).
         places: the first row of each cell, and how many it has.
-        documents: others that were made together with these, by their keys.
+        documents: others that were made together with these, by their keys, as JSON: as objects
+            they would take several times the memory.
     """
 
     name: str
     size: int
     cells: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     places: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    documents: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls, results: Sequence[Result], documents: Mapping[str, Mapping[str, Any]], size: int
-    ) -> Part:
+    def of(cls, results: Sequence[Result], documents: Mapping[str, str], size: int) -> Part:
         """That of some results which share a file of so many bytes."""
         keys = [*(result.key for result in results), *documents]
         return cls(
@@ -64,6 +65,17 @@ class Part:
             _BYTES: self.size,
         }
 
+    @classmethod
+    def read(cls, name: str, document: Mapping[str, Any]) -> Part:
+        """That of such a file."""
+        return cls(
+            name,
+            document[_BYTES],
+            {key: _packed(about) for key, about in document["cells"].items()},
+            {key: (first, count) for key, (first, count) in document["places"].items()},
+            document["documents"],
+        )
+
 
 class Store:
     """The folder of a study's finished cells.
@@ -80,7 +92,7 @@ class Store:
             self.folder / name for name in ("results", "about", "unused")
         )
         self._parts: dict[str, Part] = {}  # by the keys of their cells and documents
-        self._read: tuple[object, Any] | None = None
+        self._read: tuple[str, tuple[str, ...] | None, Any] | None = None
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -155,13 +167,7 @@ class Store:
             document = self._document(path.stem)
             if document is None or "cells" not in document:
                 continue
-            part = Part(
-                path.stem,
-                document[_BYTES],
-                {key: _packed(about) for key, about in document["cells"].items()},
-                {key: (first, count) for key, (first, count) in document["places"].items()},
-                document["documents"],
-            )
+            part = Part.read(path.stem, document)
             for folder in (self.results, self._unused):
                 rows = folder / f"{path.stem}.parquet"
                 if not part.cells or (rows.is_file() and rows.stat().st_size == part.size):
@@ -209,12 +215,13 @@ class Store:
                 self._put([result], {}, result.rows, self.results)
             results = []
         if results or documents:
-            self._put(results, documents or {}, rows, self.results)
+            texts = {key: _text(document) for key, document in (documents or {}).items()}
+            self._put(results, texts, rows, self.results)
 
     def _put(
         self,
         results: Sequence[Result],
-        documents: Mapping[str, Mapping[str, Any]],
+        documents: Mapping[str, str],
         rows: bytes,
         folder: Path,
     ) -> None:
@@ -225,10 +232,14 @@ class Store:
                 temporary.write_bytes(rows)
         self._remember(part, part.cells if folder == self.results else ())
 
-    def document(self, key: str) -> Mapping[str, Any] | None:
+    def document(self, key: str) -> dict[str, Any] | None:
         """A document that was kept under a key, if it was, and is as it was written."""
         part = self._parts.get(key)
-        return part.documents[key] if part is not None else self._document(key)
+        return self._document(key) if part is None else _object(part.documents[key])
+
+    def holds(self, key: str) -> bool:
+        """Whether such a document is there, and as it was written."""
+        return key in self._parts or self._document(key) is not None
 
     def keep(self, key: str, document: Mapping[str, Any]) -> None:
         """Keep a document under a key, with its digest."""
@@ -236,15 +247,15 @@ class Store:
 
     def _document(self, name: str) -> dict[str, Any] | None:
         with suppress(OSError, ValueError, RecursionError):
-            document = json.loads(self._details(name).read_text("utf-8"))
-            if isinstance(document, dict) and document.pop(_DIGEST, None) == _digest(document):
-                return document
+            text = self._details(name).read_text("utf-8")
+            if text[:_AFTER] == _digest(text[_AFTER:]):
+                return _object("{" + text[_AFTER + len('", ') :])
         return None
 
     def _write(self, name: str, document: Mapping[str, Any]) -> None:
-        text = json.dumps({**document, _DIGEST: _digest(document)}, allow_nan=False)
+        rest = f'", {_text(document)[1:]}'
         with written_whole(self._details(name)) as temporary:
-            temporary.write_text(text, "utf-8")
+            temporary.write_text(_digest(rest) + rest, "utf-8")
 
     @property
     def files(self) -> list[Path]:
@@ -258,11 +269,22 @@ class Store:
         Raises:
             LaeError: if the file is damaged; it says what to do.
         """
+        _, first, count = self.place(cell)
+        return self.file(cell, columns).slice(first, count)
+
+    def file(self, cell: Cell, columns: Sequence[str] | None = None) -> Any:
+        """The same of all cells whose rows are in its file (see :meth:`place`)."""
+        part, wanted = self._parts[cell.key], None if columns is None else tuple(columns)
+        if self._read is None or self._read[:2] != (part.name, wanted):
+            self._read = None  # or two of them would be held
+            rows = read_rows(self.results / f"{part.name}.parquet", columns)
+            self._read = part.name, wanted, rows
+        return self._read[2]
+
+    def place(self, cell: Cell) -> tuple[str, int, int]:
+        """The file of a finished cell's rows, the first of them in it, and how many they are."""
         part = self._parts[cell.key]
-        wanted = part.name, None if columns is None else tuple(columns)
-        if self._read is None or self._read[0] != wanted:
-            self._read = wanted, read_rows(self.results / f"{part.name}.parquet", columns)
-        return self._read[1].slice(*part.places[cell.key])
+        return part.name, *part.places[cell.key]
 
     def about(self, cell: Cell) -> Mapping[str, Any]:
         """What is known of a finished cell beside its rows (see :class:`Result`)."""
@@ -288,6 +310,15 @@ def _unpacked(about: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _digest(document: Mapping[str, Any]) -> str:
-    """Of all that a document holds, in its order."""
-    return text_digest(json.dumps(document, allow_nan=False))
+def _text(document: Mapping[str, Any]) -> str:
+    return json.dumps(document, allow_nan=False)
+
+
+def _object(text: str) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(text)
+    return document
+
+
+def _digest(rest: str) -> str:
+    """How a file of details begins whose rest this is."""
+    return _DIGEST + text_digest(rest)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import groupby
 from sys import intern
 from typing import Any
 
@@ -21,7 +22,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED, Ranking, interval, summed
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.study.cells import Cell, Setting
+from lae_sim.study.cells import Cell, Input, Setting
 from lae_sim.study.plan import Plan, Source
 from lae_sim.study.records import (
     MEAN,
@@ -114,6 +115,33 @@ _REPEATED = ("auc", "dp20", "failure_frame", "failure_time")
 _ONCE = ("world_frames", "processed", "elapsed_ms", "init_ms", "lost_share",
          *(f"offline_{m}" for m in METRICS))  # fmt: skip
 _MODELLED = tuple(f"modelled_{metric}" for metric in MODELLED)
+_READ = tuple(dict.fromkeys(
+    ["sequence", "repetition", *METRICS, *_STALENESS, *_MODELLED, *_REPEATED, *_ONCE]
+))  # fmt: skip
+
+
+class Layer(Mapping[str, Floats]):
+    """One of several of the same shape, whose arrays are held together.
+
+    Args:
+        arrays: of all of them, along the first axis.
+        place: of this one there.
+    """
+
+    __slots__ = ("_arrays", "_place")
+
+    def __init__(self, arrays: Mapping[str, Floats], place: int) -> None:
+        self._arrays, self._place = arrays, place
+
+    def __getitem__(self, name: str) -> Floats:
+        values: Floats = self._arrays[name][self._place]
+        return values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        return len(self._arrays)
 
 
 def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
@@ -123,78 +151,124 @@ def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
     for cell in plan.cells:
         same = replace(cell.setting, first=0, count=1)
         together.setdefault((same, cell.forecaster, cell.convention), []).append(cell)
-    for cells in together.values():
-        if all(store.has(cell) for cell in cells):
-            yield _read(cells, sources[cells[0].setting.trace], store)
+    finished = (cells for cells in together.values() if all(map(store.has, cells)))
+
+    def alike(cells: Sequence[Cell]) -> tuple[object, ...]:
+        """What those have in common that are read at once."""
+        setting, (file, _, rows) = cells[0].setting, store.place(cells[0])
+        is_modelled = store.about(cells[0])["modelled"] is not None
+        alone = cells[0].key if len(cells) > 1 else ""
+        return file, rows, setting.count, len(setting.world.sigmas), is_modelled, alone
+
+    for _, some in groupby(finished, alike):
+        yield from _read([*some], sources, store)
 
 
-def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
-    """The scores of cells that differ in their repetitions alone."""
-    first = cells[0]
-    count = len(first.setting.world.sigmas)
-    about = tuple(store.about(cell) for cell in cells)
-    modelled = _MODELLED if any(each["modelled"] for each in about) else ()
-    numbers = [*METRICS, *_STALENESS, *modelled]
-    totals: dict[str, Any] = {}
+def _read(
+    groups: Sequence[Sequence[Cell]], sources: Mapping[Input, Source], store: Store
+) -> Iterator[Scores]:
+    """The scores of some groups of cells, each of the same shape and with its rows in one file.
+
+    The cells of a group differ in their repetitions alone: where there is more than one group, each
+    is of one cell.
+    """
+    about = [tuple(store.about(cell) for cell in cells) for cells in groups]
+    modelled = _MODELLED if any(each["modelled"] for each in about[0]) else ()
+    totals: dict[str, Floats] = {}  # by group and sequence, and by sigma or not
     repeated: dict[str, list[Floats]] = {name: [] for name in (*_REPEATED, *modelled)}
-    over_sigmas: dict[str, list[Floats]] = {name: [] for name in ("auc", "dp20", *modelled)}
+    over_sigmas: dict[str, list[Floats]] = {name: [] for name in (*MODELLED, *modelled)}
     applies: Bools | None = None
-    names: tuple[str, ...] = ()
-    for cell in cells:
-        wanted = dict.fromkeys([*numbers, *_REPEATED, *_ONCE])
-        rows = store.rows(cell, [*wanted, "sequence", "repetition"])
-        exact = np.isnan(_column(rows, "lost_share"))
-
-        def column(name: str, rows: Any = rows, exact: Bools = exact) -> Floats:
-            values = _column(rows, name)
-            if name in _MODELLED:
-                return np.where(exact, _column(rows, name.removeprefix("modelled_")), values)
-            return np.where(exact, 0.0, values) if name == "lost_share" else values
-
-        entries = rows.num_rows // count
-        sequences = rows.column("sequence").chunk(0)  # its take would import pyarrow.compute
-        of_entry = [sequences[row].as_py() for row in range(0, rows.num_rows, count)]
-        names = tuple(map(intern, sorted(set(of_entry))))
-        place = {name: s for s, name in enumerate(names)}
-        order = np.lexsort((  # by repetition, then by sequence
-            np.array([place[name] for name in of_entry]), column("repetition")[::count],
-        ))  # fmt: skip
-        shape = (cell.setting.count, len(names), count)
-        modelled_here = ~exact & (column("failure_frame") >= 0)  # and scored
-        here = np.logical_or.reduce(modelled_here[::count][order].reshape(shape[:2]))
+    names: list[tuple[str, ...]] = []
+    for cells in zip(*groups):
+        entries = _Entries(cells, store)
+        names, here = entries.names, entries.is_modelled
         applies = here if applies is None else np.logical_or(applies, here)
-        for name in wanted:
-            values = column(name).reshape(entries, count)[order].reshape(shape)
+        for name in dict.fromkeys([*METRICS, *_STALENESS, *modelled, *_REPEATED, *_ONCE]):
+            values = entries.column(name)
             if name in repeated:
-                repeated[name].append(values[:, :, 0])
+                repeated[name].append(values[..., 0])
             if name in over_sigmas:
-                over_sigmas[name].append(values.mean(axis=2))
-            values = values[:, :, 0] if name in _ONCE else values
+                over_sigmas[name].append(values.mean(axis=3))
+            if name in _ONCE:
+                values = values[..., 0]
             # one after another from the first repetition on, however they were dealt out
-            before = [totals[name][None]] if name in totals else []
+            before = [totals[name][:, None]] if name in totals else []
             combine = np.maximum if name in _WORST else np.add
-            totals[name] = combine.reduce(np.concatenate([*before, values]))
-    count = sum(cell.setting.count for cell in cells)
+            totals[name] = combine.reduce(np.concatenate([*before, values], axis=1), axis=1)
+    count = sum(cell.setting.count for cell in groups[0])
     for name in totals.keys() - _WORST:
         totals[name] = totals[name] / count
-    return Scores(
-        source=source,
-        setting=first.setting,
-        forecaster=first.forecaster,
-        convention=first.convention,
-        sequences=names,
-        means={name: totals[name] for name in numbers},
-        repeated={name: np.concatenate(parts) for name, parts in repeated.items()},
-        over_sigmas={name: np.concatenate(parts) for name, parts in over_sigmas.items()},
-        once={name: totals[name] for name in _ONCE},
-        about=about,
-        modelled_sequences=0 if applies is None else int(applies.sum()),
-        keys=tuple(cell.key for cell in cells),
+    means = {name: totals[name] for name in (*METRICS, *_STALENESS, *modelled)}
+    once = {name: totals[name] for name in _ONCE}
+    by_repetition, plain_means = (
+        {name: np.concatenate(parts, axis=1) for name, parts in some.items()}
+        for some in (repeated, over_sigmas)
     )
+    for n, cells in enumerate(groups):
+        yield Scores(
+            source=sources[cells[0].setting.trace],
+            setting=cells[0].setting,
+            forecaster=cells[0].forecaster,
+            convention=cells[0].convention,
+            sequences=names[n],
+            means=Layer(means, n),
+            repeated=Layer(by_repetition, n),
+            over_sigmas=Layer(plain_means, n),
+            once=Layer(once, n),
+            about=about[n],
+            modelled_sequences=0 if applies is None else int(applies[n].sum()),
+            keys=tuple(cell.key for cell in cells),
+        )
 
 
-def _column(rows: Any, name: str) -> Floats:
-    return to_numpy(rows.column(name).chunk(0), COLUMNS[name]).astype(np.float64)
+class _Entries:
+    """The rows of N cells of the same shape, which stand in the same file.
+
+    Attributes:
+        names: of each cell's sequences, sorted.
+    """
+
+    def __init__(self, cells: Sequence[Cell], store: Store) -> None:
+        self._file = store.file(cells[0], _READ)
+        setting = cells[0].setting
+        count, repetitions = len(setting.world.sigmas), setting.count
+        sequences = self._file.column("sequence").chunk(0)  # its take imports pyarrow.compute
+        repetition = to_numpy(self._file.column("repetition").chunk(0), COLUMNS["repetition"])
+        known: dict[tuple[str, ...], tuple[str, ...]] = {}  # most are the same
+        self.names, rows = [], []
+        for cell in cells:
+            _, first, size = store.place(cell)
+            some = np.arange(first, first + size, count)  # the first row of each entry
+            of_entry = [sequences[row].as_py() for row in some.tolist()]
+            names = tuple(map(intern, sorted(set(of_entry))))
+            place = {name: s for s, name in enumerate(names)}
+            by_name = np.array([place[name] for name in of_entry])
+            # by repetition, then by sequence
+            rows.append(some[np.lexsort((by_name, repetition[some]))])
+            self.names.append(known.setdefault(names, names))
+        places = np.stack(rows).reshape(len(cells), repetitions, -1, 1)
+        self._rows = places + np.arange(count)  # [N, R, S, M]
+        self._exact = np.isnan(self._values("lost_share"))
+
+    @property
+    def is_modelled(self) -> Bools:
+        """Of which sequences the search model says something that is scored, bool [N, S]."""
+        here = ~self._exact[..., 0] & (self._values("failure_frame")[..., 0] >= 0)
+        return np.logical_or.reduce(here, axis=1)
+
+    def column(self, name: str) -> Floats:
+        """A column by cell, repetition, sequence and sigma, float64 [N, R, S, M].
+
+        What is modelled is as recorded where the replay is exact, and no output is lost there.
+        """
+        values = self._values(name)
+        if name in _MODELLED:
+            return np.where(self._exact, self._values(name.removeprefix("modelled_")), values)
+        return np.where(self._exact, 0.0, values) if name == "lost_share" else values
+
+    def _values(self, name: str) -> Floats:
+        values = to_numpy(self._file.column(name).chunk(0), COLUMNS[name])
+        return values[self._rows].astype(np.float64, copy=False)
 
 
 def summarise_study(
