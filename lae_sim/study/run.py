@@ -37,6 +37,7 @@ from lae_sim.study.summary import (
     read_scores,
     summarise_study,
 )
+from lae_sim.study.uncertainty import Answers
 from lae_sim.study.verdict import verdict
 from lae_sim.study.work import Batch, Description, Done, Work, attempt, attempt_batch, batches
 from lae_sim.trace.describe import is_measured
@@ -47,6 +48,9 @@ if TYPE_CHECKING:
 
 PAIRS = "comparisons.parquet"
 """The file of all pairs of traces."""
+
+ANSWERS = "answers"
+"""The document of what resampling the scores said (see :class:`.uncertainty.Answers`)."""
 
 FEW = 30_000
 """Pairs, counted twice, that are sooner compared here than handed to workers."""
@@ -332,19 +336,23 @@ def _run(
         if not scores:
             raise LaeError(f"nothing could be computed: {failures[0].reason}")
         compared = _compare(scores, study.seed, store, run, failures, progress)
-    progress("summing up", len(pieces), len(pieces))
-    answers = ((search, store.document(search.key)) for search in asked)
+        progress("summing up", len(pieces), len(pieces))
+        answers = Answers(store.document(ANSWERS))
+        summary = tuple(summarise_study(scores, study.seed, answers=answers, run=run))
+    if answers.differ:
+        store.keep(ANSWERS, answers.document())
+    curves = ((search, store.document(search.key)) for search in asked)
     results = StudyResults(
         folder=store.folder,
         plan=plan,
         scores=scores,
-        summary=tuple(summarise_study(scores, study.seed)),
+        summary=summary,
         comparisons=compared[0],
         pairs=compared[1],
         required=tuple(
-            requirement(search, Curve(**answer), auc)
-            for search, answer in answers
-            if answer
+            requirement(search, Curve(**curve), auc)
+            for search, curve in curves
+            if curve
             for auc in search.required
         ),
         traces=tuple(

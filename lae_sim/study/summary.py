@@ -7,22 +7,25 @@ for these very sequences.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import groupby
+from functools import partial
+from itertools import groupby, islice
 from sys import intern
 from typing import Any
 
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats
-from lae_sim.comparison.statistics import RESAMPLES, Bootstrap, Difference, Interval, holm
+from lae_sim.comparison.statistics import RESAMPLES, Interval, holm
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED, Ranking, interval, summed
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.cells import Cell, Input, Setting
+from lae_sim.study.executors import RunAll, run_here
 from lae_sim.study.plan import Plan, Source
 from lae_sim.study.records import (
     MEAN,
@@ -34,6 +37,16 @@ from lae_sim.study.records import (
 )
 from lae_sim.study.rows import COLUMNS
 from lae_sim.study.store import Store
+from lae_sim.study.uncertainty import (
+    Answers,
+    Resamples,
+    Sample,
+    difference_of,
+    differences,
+    plain,
+    uncertainties,
+    uncertainty_of,
+)
 from lae_sim.trace.columns import to_numpy
 
 
@@ -109,6 +122,11 @@ class Scores:
         return self.over_sigmas if over_sigmas else self.repeated
 
 
+FEW = 20_000
+"""Sequences of missing answers, about, that are sooner resampled here than handed to workers."""
+
+_AS_DEAR = 30  # sequences as the rest of an answer
+_PIECE = 128  # answers
 _WORST = {"age_max", "longest_stale"}
 _STALENESS = ("mismatch_mean", "age_mean", *sorted(_WORST))
 _REPEATED = ("auc", "dp20", "failure_frame", "failure_time")
@@ -272,7 +290,11 @@ class _Entries:
 
 
 def summarise_study(
-    scores: Sequence[Scores], seed: int = 0, resamples: int = RESAMPLES
+    scores: Sequence[Scores],
+    seed: int = 0,
+    resamples: int = RESAMPLES,
+    answers: Answers | None = None,
+    run: RunAll = run_here,
 ) -> list[SummaryRow]:
     """A row per trace, setting, convention, forecaster and sigma, and one of their means.
 
@@ -280,20 +302,23 @@ def summarise_study(
         scores: all of a study.
         seed: of the resamples.
         resamples: of the bootstrap.
+        answers: those that are known, which are not sought again; new ones are added.
+        run: the workers, for what is worth to be handed to them.
 
     Returns:
         Rows in the order of the scores. Intervals and tests stand in the rows of the first sigma
         and of the mean over sigma; so does how far each trace with each forecaster is behind the
         best of those with the same sequences.
     """
-    bootstrap = Bootstrap(resamples, seed)
+    how, answers = Resamples(seed, resamples), Answers() if answers is None else answers
     hold = {each.identity: each for each in scores if each.forecaster == "hold"}
     rankings = rankings_of(scores)
+    _resample([(each, hold.get(each.identity)) for each in scores], how, answers, run)
     rows: list[SummaryRow] = []
     rivals: dict[tuple[Any, ...], list[int]] = {}
     ranks: dict[tuple[Any, ...], list[tuple[int, Scores]]] = {}
     for each in scores:
-        for row in _rows(each, hold.get(each.identity), bootstrap):
+        for row in _rows(each, hold.get(each.identity), how, answers):
             row = replace(row, ranked_by=rankings[each.group].by)
             rival = (*each.group, each.sequences, each.forecaster, row.sigma)
             rivals.setdefault(rival, []).append(len(rows))
@@ -306,14 +331,14 @@ def summarise_study(
             rows[places[place]] = replace(rows[places[place]], pareto=True)
     for some in ranks.values():
         ranked_rows = [(rows[place], each) for place, each in some]
-        behind = _behind(ranked_rows, rankings[some[0][1].group], bootstrap)
+        behind = _behind(ranked_rows, rankings[some[0][1].group], how, answers)
         for (place, _), found in zip(some, behind):
             rows[place] = replace(rows[place], behind=found)
     return rows
 
 
 def _behind(
-    rivals: Sequence[tuple[SummaryRow, Scores]], ranking: Ranking, bootstrap: Bootstrap
+    rivals: Sequence[tuple[SummaryRow, Scores]], ranking: Ranking, how: Resamples, answers: Answers
 ) -> list[Behind | None]:
     """How far each of some rows is behind the best of them; None of that one.
 
@@ -322,14 +347,22 @@ def _behind(
     1996, Ch. 4.
     """
     best, of_best = max(rivals, key=lambda rival: rival[0].score("auc") or 0)
-    known: dict[int, Difference] = {}
-    for i, (row, scores) in enumerate(rivals):
-        if row is not best:
-            first, second = _paired(scores, of_best, ranking, row.sigma == MEAN)
+    over_sigmas = best.sigma == MEAN
+    keys = {
+        i: how.key("behind", ranking.by, over_sigmas, scores.keys, of_best.keys)
+        for i, (row, scores) in enumerate(rivals)
+        if row is not best
+    }
+    margins: dict[str, Floats] = {}
+    for i, key in keys.items():
+        if not answers.has(key):
+            first, second = _paired(rivals[i][1], of_best, ranking, over_sigmas)
+            answers.put(key, None)
             if first.size:
-                differences = first.mean(axis=0) - second.mean(axis=0)
-                [margins] = bootstrap.means(differences[None])
-                known[i] = bootstrap.compare(differences, 0.0, margins, 0.0)
+                margins[key] = first.mean(axis=0) - second.mean(axis=0)
+    for key, difference in zip(margins, differences([*margins.values()], how)):
+        answers.put(key, plain(difference))
+    known = {i: difference_of(answers[key]) for i, key in keys.items() if answers[key] is not None}
     corrected = dict(zip(known, holm([difference.p for difference in known.values()])))
     name = best.run, best.forecaster
     return [
@@ -345,7 +378,9 @@ def rankings_of(scores: Sequence[Scores]) -> dict[tuple[str, ...], Ranking]:
     return {group: Ranking.of(some) for group, some in replays.items()}
 
 
-def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator[SummaryRow]:
+def _rows(
+    scores: Scores, hold: Scores | None, how: Resamples, answers: Answers
+) -> Iterator[SummaryRow]:
     setting, metadata, sigmas = scores.setting, scores.source.metadata, scores.setting.world.sigmas
     departures = sum(about["approximate_outputs"] for about in scores.about)
     calls = sum(about["calls"] for about in scores.about)
@@ -382,7 +417,7 @@ def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator
             row,
             sigma=sigma,
             scores={metric: _mean(scores.means[metric][:, s]) for metric in METRICS},
-            uncertainty=_uncertainty(scores, hold, bootstrap, over_sigmas=False) if s == 0 else {},
+            uncertainty=_uncertainty(_key(scores, hold, False, how), answers) if s == 0 else {},
             staleness=_staleness(scores, s),
             modelled=_modelled(scores, [s], "first" if s == 0 else None),
         )
@@ -392,7 +427,7 @@ def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator
         yield replace(
             row,
             scores={metric: _mean_of_means(scores.means[metric][:, grid]) for metric in METRICS},
-            uncertainty=_uncertainty(scores, hold, bootstrap, over_sigmas=True) if whole else {},
+            uncertainty=_uncertainty(_key(scores, hold, True, how), answers) if whole else {},
             modelled=_modelled(scores, grid, "mean" if whole else None),
         )
 
@@ -424,11 +459,46 @@ def _modelled(scores: Scores, at: Sequence[int], draws: str | None) -> Modelled 
     return Modelled(cells[0]["known"], lost, means, intervals)
 
 
-def _uncertainty(
-    scores: Scores, hold: Scores | None, bootstrap: Bootstrap, over_sigmas: bool
-) -> dict[str, Uncertainty]:
-    """How sure mean AUC and DP are, and what is won over hold; those of a known reach too."""
-    uncertain = {}
+def _resample(
+    all_scores: Iterable[tuple[Scores, Scores | None]],
+    how: Resamples,
+    answers: Answers,
+    run: RunAll,
+) -> None:
+    """Add the answers that are missing: how sure the means of scores are, beside hold's."""
+    missing = {
+        key: (scores, hold, over_sigmas)
+        for scores, hold in all_scores
+        for over_sigmas in (False, True)[: 1 + _is_whole_grid(scores)]
+        if not answers.has(key := _key(scores, hold, over_sigmas, how))
+    }
+    few = sum(len(scores.sequences) + _AS_DEAR for scores, _, _ in missing.values()) < FEW
+    asked = ((key, _samples(*each)) for key, each in missing.items())
+    pieces = iter(lambda: [*islice(asked, _PIECE)], [])
+    work = partial(_resampled, how=how)
+    with closing((run_here if few else run)(work, pieces)) as found:
+        for piece, of_piece in found:
+            for (key, _), answer in zip(piece, of_piece):
+                answers.put(key, answer)
+
+
+def _resampled(
+    piece: Sequence[tuple[str, Mapping[str, Sample]]], how: Resamples
+) -> list[dict[str, Any]]:
+    """The answers to a piece, by metric."""
+    found = iter(uncertainties([each for _, some in piece for each in some.values()], how))
+    return [{metric: plain(next(found)) for metric in some} for _, some in piece]
+
+
+def _key(scores: Scores, hold: Scores | None, over_sigmas: bool, how: Resamples) -> str:
+    """Digest of all that the answer depends on."""
+    base = None if hold is None or hold is scores else hold.keys
+    return how.key("mean", over_sigmas, scores.keys, base)
+
+
+def _samples(scores: Scores, hold: Scores | None, over_sigmas: bool) -> dict[str, Sample]:
+    """What is uncertain of AUC and DP; of those of a known reach too."""
+    samples = {}
     for metric in (*MODELLED, *(_MODELLED if scores.known else ())):
         values = scores.by_repetition(over_sigmas)[metric]
         base = None if hold is None or hold is scores else hold.by_repetition(over_sigmas)[metric]
@@ -437,21 +507,22 @@ def _uncertainty(
             kept &= ~np.isnan(base.mean(axis=0))
         if not kept.any():
             continue
-        mean = values[:, kept].mean(axis=0)
-        jitter = bootstrap.interval(values[:, kept].mean(axis=1)) if len(values) > 1 else None
         if base is None:
-            [means] = bootstrap.means(mean[None])
-            uncertain[metric] = Uncertainty(bootstrap.interval(means), jitter)
-            continue
-        offline = scores.once[f"offline_{metric.removeprefix('modelled_')}"][kept]
-        bare = base[:, kept].mean(axis=0)
-        means, held, losses = bootstrap.means(np.stack([mean, bare, offline - bare]))
-        difference, share = bootstrap.compare(mean, bare, means, held), None
-        if not np.isnan(offline).any():
-            lost = float(offline.mean() - bare.mean())
-            share = bootstrap.recover(difference.value, lost, means - held, losses)
-        uncertain[metric] = Uncertainty(bootstrap.interval(means), jitter, difference, share)
-    return uncertain
+            samples[metric] = Sample(values[:, kept])
+        else:
+            offline = scores.once[f"offline_{metric.removeprefix('modelled_')}"][kept]
+            samples[metric] = Sample(values[:, kept], base[:, kept].mean(axis=0), offline)
+    return samples
+
+
+def _uncertainty(key: str, answers: Answers) -> dict[str, Uncertainty]:
+    """How sure mean AUC and DP are, and what is won over hold; those of a known reach too."""
+    return {metric: uncertainty_of(answer) for metric, answer in answers[key].items()}
+
+
+def _is_whole_grid(scores: Scores) -> bool:
+    """Whether the sigmas are those of the grid, so that means over them are uncertain too."""
+    return set(SIGMA_GRID) == set(scores.setting.world.sigmas)
 
 
 def _staleness(scores: Scores, s: int) -> Staleness:
