@@ -225,11 +225,18 @@ class PairsFile:
         for each in rivals:
             if each.key not in self.places:
                 continue
-            table, best = self.rows(each.key), each.best if self.total > MOST else None
-            if best is not None:
-                names = zip(*(table.column(side).to_pylist() for side in "ab"))
-                table = table.take([row for row, pair in enumerate(names) if best in pair])
-            yield from map(_record, table.to_pylist())
+            table = self.rows(each.key)
+            if self.total <= MOST:
+                yield from map(_record, table.to_pylist())
+                continue
+            best, names = each.best, zip(*(table.column(side).to_pylist() for side in "ab"))
+            some = [row for row, pair in enumerate(names) if best in pair]
+            chosen = [  # take would import pandas
+                [column.chunk(0)[row].as_py() for row in some]
+                for column in table.combine_chunks().columns
+            ]
+            for values in zip(*chosen):
+                yield _record(dict(zip(table.column_names, values)))
 
 
 def _schema() -> Any:

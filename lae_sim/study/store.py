@@ -164,8 +164,8 @@ class Store:
     def _found(self) -> Iterator[tuple[Part, Path]]:
         """What is whole, with the file of its rows, in the order of the names."""
         for path in sorted(self._about.glob("*.json")):
-            document = self._document(path.stem)
-            if document is None or "cells" not in document:
+            document = self._document(path.stem, begins='{"cells": ')
+            if document is None:
                 continue
             part = Part.read(path.stem, document)
             for folder in (self.results, self._unused):
@@ -245,11 +245,13 @@ class Store:
         """Keep a document under a key, with its digest."""
         self._write(key, document)
 
-    def _document(self, name: str) -> dict[str, Any] | None:
+    def _document(self, name: str, begins: str = "{") -> dict[str, Any] | None:
+        """What a file of details holds, if it begins so, and is as it was written."""
         with suppress(OSError, ValueError, RecursionError):
-            text = self._details(name).read_text("utf-8")
-            if text[:_AFTER] == _digest(text[_AFTER:]):
-                return _object("{" + text[_AFTER + len('", ') :])
+            whole = self._details(name).read_text("utf-8")
+            text = "{" + whole[_AFTER + len('", ') :]
+            if text.startswith(begins) and whole[:_AFTER] == _digest(whole[_AFTER:]):
+                return _object(text)
         return None
 
     def _write(self, name: str, document: Mapping[str, Any]) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import partial
+from functools import cached_property, partial
 from itertools import groupby, islice
 from sys import intern
 from typing import Any
@@ -97,7 +97,7 @@ class Scores:
         """Whether every output follows the same frame as when it was recorded."""
         return not any(each["approximate_outputs"] for each in self.about)
 
-    @property
+    @cached_property
     def group(self) -> tuple[str, ...]:
         """What scores must share to be compared: dataset, world, latency, search, convention."""
         setting = self.setting
@@ -421,7 +421,7 @@ def _rows(
             staleness=_staleness(scores, s),
             modelled=_modelled(scores, [s], "first" if s == 0 else None),
         )
-    if set(SIGMA_GRID) <= set(sigmas):
+    if _has_grid(sigmas):
         grid = [s for s, sigma in enumerate(sigmas) if sigma in SIGMA_GRID]
         whole = len(grid) == len(sigmas)
         yield replace(
@@ -522,7 +522,13 @@ def _uncertainty(key: str, answers: Answers) -> dict[str, Uncertainty]:
 
 def _is_whole_grid(scores: Scores) -> bool:
     """Whether the sigmas are those of the grid, so that means over them are uncertain too."""
-    return set(SIGMA_GRID) == set(scores.setting.world.sigmas)
+    sigmas = scores.setting.world.sigmas
+    return len(sigmas) == len(SIGMA_GRID) and _has_grid(sigmas)
+
+
+def _has_grid(sigmas: Sequence[Fraction]) -> bool:
+    """Whether all sigmas of the grid are among some."""
+    return len(sigmas) >= len(SIGMA_GRID) and set(SIGMA_GRID) <= set(sigmas)
 
 
 def _staleness(scores: Scores, s: int) -> Staleness:
