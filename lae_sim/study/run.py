@@ -19,7 +19,7 @@ from lae_sim import __version__
 from lae_sim._compiled import amount
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.caveats import at_the_floor, floor_notes
-from lae_sim.files import check_distinct, csv_cell, written_whole
+from lae_sim.files import check_distinct, csv_cell, text_digest, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
 from lae_sim.study.cells import Result, Task
@@ -30,17 +30,18 @@ from lae_sim.study.pairs import Pairs
 from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import MEAN, Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
-from lae_sim.study.store import Store
+from lae_sim.study.store import Documents, Store
 from lae_sim.study.summary import (
     Scores,
     rankings_of,
     read_scores,
     summarise_study,
 )
-from lae_sim.study.uncertainty import Answers
+from lae_sim.study.uncertainty import Answers, Resamples
 from lae_sim.study.verdict import verdict
 from lae_sim.study.work import Batch, Description, Done, Work, attempt, attempt_batch, batches
 from lae_sim.trace.describe import is_measured
+from lae_sim.trace.locate import digest
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -48,6 +49,9 @@ if TYPE_CHECKING:
 
 PAIRS = "comparisons.parquet"
 """The file of all pairs of traces."""
+
+TABLES = "tables"
+"""The document that says what the files of the summary were made of."""
 
 ANSWERS = "answers"
 """The document of what resampling the scores said (see :class:`.uncertainty.Answers`)."""
@@ -100,7 +104,7 @@ class StudyResults:
     comparisons: tuple[Comparison, ...]
     pairs: int
     required: tuple[Requirement, ...]
-    traces: tuple[dict[str, Any], ...]
+    traces: Sequence[Mapping[str, Any]]
     computed: int
     failures: tuple[Failure, ...]
     training: tuple[str, ...] = ()
@@ -230,6 +234,11 @@ class StudyResults:
 
     def document(self) -> dict[str, Any]:
         """All but the scores of single sequences, as ``study.json`` holds it."""
+        parts = self._document().items()
+        return {key: [*each] if isinstance(each, Iterator) else each for key, each in parts}
+
+    def _document(self) -> dict[str, Any]:
+        """The same, its lists of what may be many as they are gone through."""
         return {
             "format": "lae-study",
             "version": "1.0",
@@ -239,10 +248,10 @@ class StudyResults:
             "cells": len(self.plan.cells),
             "failures": flat_rows(self.failures),
             "notes": self.notes(),
-            "summary": flat_rows(self.summary),
-            "comparisons": flat_rows(self.comparisons),
-            "required": flat_rows(self.required),
-            "traces": self.traces,
+            "summary": (record.flat() for record in self.summary),
+            "comparisons": (record.flat() for record in self.comparisons),
+            "required": (record.flat() for record in self.required),
+            "traces": iter(self.traces),
         }
 
 
@@ -355,16 +364,12 @@ def _run(
             if curve
             for auc in search.required
         ),
-        traces=tuple(
-            dict(trace)
-            for trace in (store.document(each.key) for each in described)
-            if trace is not None
-        ),
+        traces=Documents(store, [each.key for each in described if store.holds(each.key)]),
         computed=computed,
         failures=tuple(sorted(failures, key=lambda failure: str(failure.flat()))),
         training=tuple(training),
     )
-    _write(results)
+    _write(results, store)
     return results
 
 
@@ -440,15 +445,18 @@ def _factories(
     return factories, notes
 
 
-def _write(results: StudyResults) -> None:
-    """Write the summary, as CSV and JSON."""
+def _write(results: StudyResults, store: Store) -> None:
+    """Write the summary, as CSV and JSON, unless those are there that were written of the same."""
     tables: dict[str, Sequence[Record]] = {
-        "summary": results.summary,
-        "comparisons": results.comparisons,
-        "required": results.required,
+        "summary.csv": results.summary,
+        "comparisons.csv": results.comparisons,
+        "required.csv": results.required,
     }
+    paths = [results.folder / name for name in ("study.json", *tables)]
+    if (before := store.document(TABLES)) and before == _written(results, paths):
+        return
     for name, records in tables.items():
-        path = results.folder / f"{name}.csv"
+        path = results.folder / name
         if records:
             write_csv(records, path)
         else:
@@ -457,7 +465,24 @@ def _write(results: StudyResults) -> None:
         written_whole(results.folder / "study.json") as temporary,
         open(temporary, "w", encoding="utf-8") as file,
     ):
-        file.writelines(_json(results.document()))
+        file.writelines(_json(results._document()))
+    store.keep(TABLES, _written(results, paths))
+
+
+def _written(results: StudyResults, paths: Sequence[Path]) -> dict[str, Any]:
+    """Digests of all that the summary depends on, and of those of its files that are there."""
+    plan = results.plan
+    made_of = (
+        __version__,
+        Resamples(plan.study.seed).key(),
+        plan.study.document(),
+        [(source.input.label, source.input.digest) for source in plan.sources],
+        [cell.key for cell in plan.cells],
+        [failure.flat() for failure in results.failures],
+        results.training,
+    )
+    files = {path.name: digest(str(path)) for path in paths if path.exists()}
+    return {"of": text_digest(repr(made_of)), "files": files}
 
 
 def _json(document: Mapping[str, Any]) -> Iterator[str]:
@@ -465,7 +490,7 @@ def _json(document: Mapping[str, Any]) -> Iterator[str]:
     yield "{"
     for place, (key, value) in enumerate(document.items()):
         yield f"{', ' * bool(place)}{json.dumps(key)}: "
-        if isinstance(value, (list, tuple)):
+        if isinstance(value, (list, Iterator)):
             yield "["
             for i, each in enumerate(value):
                 yield f"{', ' * bool(i)}{json.dumps(each, allow_nan=False)}"
@@ -477,15 +502,16 @@ def _json(document: Mapping[str, Any]) -> Iterator[str]:
 
 def write_csv(records: Sequence[Record], path: Path) -> None:
     """Write records as CSV, whole or not at all; what is unknown is empty."""
-    rows = flat_rows(records)
-    columns = list(dict.fromkeys(chain.from_iterable(rows)))
+    columns = list(dict.fromkeys(chain.from_iterable(record.flat() for record in records)))
     with (
         written_whole(path) as temporary,
         open(temporary, "w", newline="", encoding="utf-8", errors="backslashreplace") as file,
     ):
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
-        writer.writerows([csv_cell(row.get(name)) for name in columns] for row in rows)
+        for record in records:
+            row = record.flat()
+            writer.writerow([csv_cell(row.get(name)) for name in columns])
 
 
 def flat_rows(records: Sequence[Record]) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from sys import intern
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -283,6 +283,10 @@ class Store:
             self._read = part.name, wanted, rows
         return self._read[2]
 
+    def forget(self) -> None:
+        """Let go of the rows that were read last."""
+        self._read = None
+
     def place(self, cell: Cell) -> tuple[str, int, int]:
         """The file of a finished cell's rows, the first of them in it, and how many they are."""
         part = self._parts[cell.key]
@@ -294,6 +298,33 @@ class Store:
 
     def _details(self, key: str) -> Path:
         return self._about / f"{key}.json"
+
+
+class Documents(Sequence[dict[str, Any]]):
+    """Documents of a store, each made when it is looked at: all at once they may be large.
+
+    Args:
+        store: which; it has them all.
+        keys: of the documents.
+    """
+
+    def __init__(self, store: Store, keys: Sequence[str]) -> None:
+        self._store, self._keys = store, keys
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    @overload
+    def __getitem__(self, place: int) -> dict[str, Any]: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[dict[str, Any]]: ...
+    def __getitem__(self, place: int | slice) -> dict[str, Any] | list[dict[str, Any]]:
+        if isinstance(place, slice):
+            return [self[i] for i in range(len(self))[place]]
+        document = self._store.document(self._keys[place])
+        if document is None:
+            raise LaeError(f"{self._store.folder}: has changed since the study ended: run it again")
+        return document
 
 
 def _packed(about: Mapping[str, Any]) -> dict[str, Any]:

@@ -180,6 +180,7 @@ def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
 
     for _, some in groupby(finished, alike):
         yield from _read([*some], sources, store)
+    store.forget()
 
 
 def _read(
@@ -523,7 +524,7 @@ def _uncertainty(key: str, answers: Answers) -> dict[str, Uncertainty]:
 def _is_whole_grid(scores: Scores) -> bool:
     """Whether the sigmas are those of the grid, so that means over them are uncertain too."""
     sigmas = scores.setting.world.sigmas
-    return len(sigmas) == len(SIGMA_GRID) and _has_grid(sigmas)
+    return _has_grid(sigmas) and set(sigmas) == set(SIGMA_GRID)
 
 
 def _has_grid(sigmas: Sequence[Fraction]) -> bool:
