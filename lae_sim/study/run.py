@@ -181,10 +181,9 @@ class StudyResults:
     def search_sources(self) -> list[str]:
         """What is known of the reach of the trackers of traces, where something is modelled."""
         return self._of_traces(
-            (scores.setting.trace.label, f"modelled: {about['modelled']['source']}")
+            (scores.setting.trace.label, f"modelled: {source}")
             for scores in self.scores
-            for about in scores.about
-            if about["modelled"]
+            for source in scores.reach_sources
         )
 
     def _of_traces(self, said: Iterable[tuple[str, str]]) -> list[str]:
@@ -215,9 +214,7 @@ class StudyResults:
                 'measure c: lae-sim profile --gaps, then passes = ["TRACE.gaps.parquet"]; or name '
                 'it: search = "c=0.7"; search = "off" leaves the model out'
             )
-        notes += [
-            note for scores in self.scores for about in scores.about for note in about["notes"]
-        ]
+        notes += [note for scores in self.scores for note in scores.notes]
         notes += floor_notes(
             row.trace + (f" x {row.scale}" if row.scale != 1 else "")
             for row in self.summary
@@ -364,7 +361,7 @@ def _run(
             if curve
             for auc in search.required
         ),
-        traces=Documents(store, [each.key for each in described if store.holds(each.key)]),
+        traces=Documents(store.document, [each.key for each in described if store.holds(each.key)]),
         computed=computed,
         failures=tuple(sorted(failures, key=lambda failure: str(failure.flat()))),
         training=tuple(training),

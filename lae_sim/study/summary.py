@@ -12,9 +12,9 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, partial
-from itertools import groupby, islice
+from itertools import groupby, islice, product
 from sys import intern
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from lae_sim.study.records import (
     Uncertainty,
 )
 from lae_sim.study.rows import COLUMNS
-from lae_sim.study.store import Store
+from lae_sim.study.store import Documents, Store
 from lae_sim.study.uncertainty import (
     Answers,
     Resamples,
@@ -68,9 +68,15 @@ class Scores:
         over_sigmas: ``auc`` and ``dp20`` as plain means over sigma, float64 [R, S].
         once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms``, ``init_ms``,
             ``lost_share`` and the offline scores, float64 [S].
-        modelled_sequences: in how many the search model says something.
-        about: of each cell (see :class:`lae_sim.study.cells.Result`).
         keys: of each cell.
+        about: of each cell (see :class:`lae_sim.study.cells.Result`); made anew at each look.
+        engine, init_source: as of a row of the summary.
+        calls, departures: processed frames but the initialisations, and those of them whose output
+            follows another frame than when it was recorded.
+        notes: on the replays.
+        known: whether the reach is known; None where nothing is modelled.
+        reach_sources: from where it is known, of each cell where something is modelled.
+        intervals: of modelled AUC and DP, at the ``"first"`` sigma and of the ``"mean"`` over them.
     """
 
     source: Source
@@ -82,20 +88,21 @@ class Scores:
     repeated: Mapping[str, Floats]
     over_sigmas: Mapping[str, Floats]
     once: Mapping[str, Floats]
-    about: tuple[Mapping[str, Any], ...]
-    modelled_sequences: int
     keys: tuple[str, ...]
-
-    @property
-    def known(self) -> bool | None:
-        """Whether the reach is known; None where nothing is modelled."""
-        found = {each["modelled"]["known"] for each in self.about if each["modelled"]}
-        return found.pop() if found else None
+    about: Sequence[Mapping[str, Any]]
+    engine: str
+    init_source: str
+    calls: int
+    departures: int
+    notes: tuple[str, ...]
+    known: bool | None
+    reach_sources: tuple[str, ...]
+    intervals: Mapping[str, Mapping[str, Interval]]
 
     @property
     def is_exact(self) -> bool:
         """Whether every output follows the same frame as when it was recorded."""
-        return not any(each["approximate_outputs"] for each in self.about)
+        return not self.departures
 
     @cached_property
     def group(self) -> tuple[str, ...]:
@@ -133,6 +140,7 @@ _REPEATED = ("auc", "dp20", "failure_frame", "failure_time")
 _ONCE = ("world_frames", "processed", "elapsed_ms", "init_ms", "lost_share",
          *(f"offline_{m}" for m in METRICS))  # fmt: skip
 _MODELLED = tuple(f"modelled_{metric}" for metric in MODELLED)
+_Group: TypeAlias = tuple[Sequence[Cell], Sequence[Mapping[str, Any]]]
 _READ = tuple(dict.fromkeys(
     ["sequence", "repetition", *METRICS, *_STALENESS, *_MODELLED, *_REPEATED, *_ONCE]
 ))  # fmt: skip
@@ -169,29 +177,37 @@ def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
     for cell in plan.cells:
         same = replace(cell.setting, first=0, count=1)
         together.setdefault((same, cell.forecaster, cell.convention), []).append(cell)
-    finished = (cells for cells in together.values() if all(map(store.has, cells)))
+    finished = (
+        (cells, tuple(store.about(cell) for cell in cells))
+        for cells in together.values()
+        if all(map(store.has, cells))
+    )
 
-    def alike(cells: Sequence[Cell]) -> tuple[object, ...]:
+    def alike(group: _Group) -> tuple[object, ...]:
         """What those have in common that are read at once."""
+        cells, about = group
         setting, (file, _, rows) = cells[0].setting, store.place(cells[0])
-        is_modelled = store.about(cells[0])["modelled"] is not None
+        is_modelled = about[0]["modelled"] is not None
         alone = cells[0].key if len(cells) > 1 else ""
         return file, rows, setting.count, len(setting.world.sigmas), is_modelled, alone
 
     for _, some in groupby(finished, alike):
-        yield from _read([*some], sources, store)
+        groups, about = zip(*some)
+        yield from _read(groups, about, sources, store)
     store.forget()
 
 
 def _read(
-    groups: Sequence[Sequence[Cell]], sources: Mapping[Input, Source], store: Store
+    groups: Sequence[Sequence[Cell]],
+    about: Sequence[Sequence[Mapping[str, Any]]],
+    sources: Mapping[Input, Source],
+    store: Store,
 ) -> Iterator[Scores]:
     """The scores of some groups of cells, each of the same shape and with its rows in one file.
 
     The cells of a group differ in their repetitions alone: where there is more than one group, each
     is of one cell.
     """
-    about = [tuple(store.about(cell) for cell in cells) for cells in groups]
     modelled = _MODELLED if any(each["modelled"] for each in about[0]) else ()
     totals: dict[str, Floats] = {}  # by group and sequence, and by sigma or not
     repeated: dict[str, list[Floats]] = {name: [] for name in (*_REPEATED, *modelled)}
@@ -234,10 +250,44 @@ def _read(
             repeated=Layer(by_repetition, n),
             over_sigmas=Layer(plain_means, n),
             once=Layer(once, n),
-            about=about[n],
-            modelled_sequences=0 if applies is None else int(applies[n].sum()),
             keys=tuple(cell.key for cell in cells),
+            about=Documents(store.about, cells),
+            engine=intern(about[n][0]["engine"]),
+            init_source=intern(about[n][0]["init_source"]),
+            calls=sum(each["calls"] for each in about[n]),
+            departures=sum(each["approximate_outputs"] for each in about[n]),
+            notes=tuple(intern(note) for each in about[n] for note in each["notes"]),
+            known=next((each["modelled"]["known"] for each in about[n] if each["modelled"]), None),
+            reach_sources=tuple(
+                intern(each["modelled"]["source"]) for each in about[n] if each["modelled"]
+            ),
+            intervals=_intervals(about[n], 0 if applies is None else int(applies[n].sum())),
         )
+
+
+def _intervals(
+    about: Sequence[Mapping[str, Any]], sequences: int
+) -> dict[str, dict[str, Interval]]:
+    """Intervals of modelled scores, from the joint draws of cells; none where they say nothing.
+
+    Args:
+        about: of cells that differ in their repetitions alone.
+        sequences: of how many the search model says something.
+    """
+    cells = [each["modelled"] for each in about if each["modelled"]]
+    repetitions = sum(each["repetitions"] for each in about)
+    found: dict[str, dict[str, Interval]] = {}
+    for draws, metric in product(("first", "mean") if cells else (), MODELLED):
+        runs = summed([np.array(cell[draws][metric]) for cell in cells])
+        # of one sequence, what is drawn and what is unexplained are the same in all repetitions
+        each = runs[:, None, :, None] / repetitions
+        rest = max(cell["unexplained"][metric] for cell in cells)
+        low, high = interval(each, cells[0]["known"], rest, sequences)
+        if np.isfinite(low).all():
+            # in whatever chunks repetitions are dealt out, whose sums differ in the last bits
+            ends = (round(end.item(), 12) for end in (low, high))
+            found.setdefault(draws, {})[metric] = Interval(*ends)
+    return found
 
 
 class _Entries:
@@ -383,8 +433,7 @@ def _rows(
     scores: Scores, hold: Scores | None, how: Resamples, answers: Answers
 ) -> Iterator[SummaryRow]:
     setting, metadata, sigmas = scores.setting, scores.source.metadata, scores.setting.world.sigmas
-    departures = sum(about["approximate_outputs"] for about in scores.about)
-    calls = sum(about["calls"] for about in scores.about)
+    departures, calls = scores.departures, scores.calls
     frames = scores.once["world_frames"]
     row = SummaryRow(
         trace=setting.trace.label,
@@ -402,12 +451,12 @@ def _rows(
         forecaster=scores.forecaster,
         sequences=len(scores.sequences),
         repetitions=len(scores.repeated["auc"]),
-        engine=scores.about[0]["engine"],
+        engine=scores.engine,
         exact=departures == 0,
         approximate_share=departures / calls if calls else 0.0,
         elapsed_ms=_mean(scores.once["elapsed_ms"]),
         init_ms=float(scores.once["init_ms"].mean()),
-        init_source=scores.about[0]["init_source"],
+        init_source=scores.init_source,
         skip_rate=float(1 - scores.once["processed"].sum() / frames.sum()),
         sigma=MEAN,
         scores={},
@@ -439,25 +488,14 @@ def _modelled(scores: Scores, at: Sequence[int], draws: str | None) -> Modelled 
     Args:
         scores: of all sequences and repetitions.
         at: indices of the sigmas.
-        draws: which joint draws of the cells make the intervals; None for none.
+        draws: which intervals belong to it; None for none.
     """
-    cells = [each["modelled"] for each in scores.about if each["modelled"]]
-    if not cells:
+    if scores.known is None:
         return None
     means = {m: _mean_of_means(scores.means[f"modelled_{m}"][:, at]) for m in MODELLED}
-    intervals = {}
-    for metric in MODELLED if draws is not None else ():
-        runs = summed([np.array(cell[draws][metric]) for cell in cells])
-        # of one sequence, what is drawn and what is unexplained are the same in all repetitions
-        each = runs[:, None, :, None] / sum(about["repetitions"] for about in scores.about)
-        rest = max(cell["unexplained"][metric] for cell in cells)
-        low, high = interval(each, cells[0]["known"], rest, scores.modelled_sequences)
-        if np.isfinite(low).all():
-            # in whatever chunks repetitions are dealt out, whose sums differ in the last bits
-            intervals[metric] = Interval(*(round(end.item(), 12) for end in (low, high)))
     outputs = scores.once["processed"]
     lost = float(scores.once["lost_share"] @ outputs / outputs.sum())
-    return Modelled(cells[0]["known"], lost, means, intervals)
+    return Modelled(scores.known, lost, means, scores.intervals.get(draws or "", {}))
 
 
 def _resample(
