@@ -133,8 +133,8 @@ class Bootstrap:
         self,
         values: Floats,
         baselines: Floats,
-        means: Sequence[Floats],
-        others: Sequence[Floats | float],
+        means: Iterable[Floats],
+        others: Iterable[Floats | float],
     ) -> list[Difference]:
         """The paired differences of some scores, each to a baseline's.
 

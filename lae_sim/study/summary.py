@@ -239,19 +239,19 @@ def _read(
         {name: np.concatenate(parts, axis=1) for name, parts in some.items()}
         for some in (repeated, over_sigmas)
     )
-    for n, cells in enumerate(groups):
+    for n, group in enumerate(groups):
         yield Scores(
-            source=sources[cells[0].setting.trace],
-            setting=cells[0].setting,
-            forecaster=cells[0].forecaster,
-            convention=cells[0].convention,
+            source=sources[group[0].setting.trace],
+            setting=group[0].setting,
+            forecaster=group[0].forecaster,
+            convention=group[0].convention,
             sequences=names[n],
             means=Layer(means, n),
             repeated=Layer(by_repetition, n),
             over_sigmas=Layer(plain_means, n),
             once=Layer(once, n),
-            keys=tuple(cell.key for cell in cells),
-            about=Documents(store.about, cells),
+            keys=tuple(cell.key for cell in group),
+            about=Documents(store.about, group),
             engine=intern(about[n][0]["engine"]),
             init_source=intern(about[n][0]["init_source"]),
             calls=sum(each["calls"] for each in about[n]),
@@ -323,7 +323,8 @@ class _Entries:
     def is_modelled(self) -> Bools:
         """Of which sequences the search model says something that is scored, bool [N, S]."""
         here = ~self._exact[..., 0] & (self._values("failure_frame")[..., 0] >= 0)
-        return np.logical_or.reduce(here, axis=1)
+        modelled: Bools = np.logical_or.reduce(here, axis=1)
+        return modelled
 
     def column(self, name: str) -> Floats:
         """A column by cell, repetition, sequence and sigma, float64 [N, R, S, M].
@@ -337,7 +338,8 @@ class _Entries:
 
     def _values(self, name: str) -> Floats:
         values = to_numpy(self._file.column(name).chunk(0), COLUMNS[name])
-        return values[self._rows].astype(np.float64, copy=False)
+        chosen: Floats = values[self._rows].astype(np.float64, copy=False)
+        return chosen
 
 
 def summarise_study(

@@ -7,7 +7,7 @@ is kept under a digest of these, and what has changed in any of them is asked an
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -63,7 +63,7 @@ class Sample:
     @property
     def rows(self) -> Floats:
         """What is resampled: the mean over the repetitions; and that of hold, and its loss."""
-        mean = self.values.mean(axis=0)
+        mean: Floats = self.values.mean(axis=0)
         if self.hold is None or self.offline is None:
             return mean[None]
         return np.stack([mean, self.hold, self.offline - self.hold])
@@ -165,12 +165,9 @@ class Answers:
         return self._asked
 
 
-def plain(answer: Interval | Difference | Recovered | Uncertainty | None) -> list[Any] | None:
-    """An answer as JSON has it: its values in their order."""
-    if answer is None:
-        return None
-    values = (getattr(answer, each.name) for each in fields(answer))
-    return [plain(value) if is_dataclass(value) else value for value in values]
+def plain(answer: Difference | Uncertainty) -> list[Any]:
+    """An answer as JSON has it: its values in their order, and so those of its parts."""
+    return list(astuple(answer))
 
 
 def difference_of(answer: Sequence[Any]) -> Difference:

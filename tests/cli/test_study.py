@@ -712,7 +712,8 @@ def test_the_summary_of_a_finished_study_is_not_written_again(
     )
     again = run(tmp_path, study)
     assert (written, contents(tmp_path)) == ([], before)
-    assert list(again.traces) == list(first.traces) == again.traces[:] and len(again.traces) == 2
+    assert list(again.traces) == list(first.traces) == again.traces[:]
+    assert len(again.traces) == 2
     both = ["summary.csv", "comparisons.csv"]
     for damage in (Path.unlink, _edited):
         for name in ("summary.csv", "study.json"):
