@@ -261,23 +261,29 @@ def _read(
             reach_sources=tuple(
                 intern(each["modelled"]["source"]) for each in about[n] if each["modelled"]
             ),
-            intervals=_intervals(about[n], 0 if applies is None else int(applies[n].sum())),
+            intervals=_intervals(
+                about[n],
+                0 if applies is None else int(applies[n].sum()),
+                _is_whole_grid(group[0].setting.world.sigmas),
+            ),
         )
 
 
 def _intervals(
-    about: Sequence[Mapping[str, Any]], sequences: int
+    about: Sequence[Mapping[str, Any]], sequences: int, over_sigmas: bool
 ) -> dict[str, dict[str, Interval]]:
     """Intervals of modelled scores, from the joint draws of cells; none where they say nothing.
 
     Args:
         about: of cells that differ in their repetitions alone.
         sequences: of how many the search model says something.
+        over_sigmas: whether those of the means over sigma are wanted too.
     """
     cells = [each["modelled"] for each in about if each["modelled"]]
     repetitions = sum(each["repetitions"] for each in about)
     found: dict[str, dict[str, Interval]] = {}
-    for draws, metric in product(("first", "mean") if cells else (), MODELLED):
+    wanted = ("first", "mean")[: 1 + over_sigmas] if cells else ()
+    for draws, metric in product(wanted, MODELLED):
         runs = summed([np.array(cell[draws][metric]) for cell in cells])
         # of one sequence, what is drawn and what is unexplained are the same in all repetitions
         each = runs[:, None, :, None] / repetitions
@@ -510,7 +516,7 @@ def _resample(
     missing = {
         key: (scores, hold, over_sigmas)
         for scores, hold in all_scores
-        for over_sigmas in (False, True)[: 1 + _is_whole_grid(scores)]
+        for over_sigmas in (False, True)[: 1 + _is_whole_grid(scores.setting.world.sigmas)]
         if not answers.has(key := _key(scores, hold, over_sigmas, how))
     }
     few = sum(len(scores.sequences) + _AS_DEAR for scores, _, _ in missing.values()) < FEW
@@ -561,9 +567,8 @@ def _uncertainty(key: str, answers: Answers) -> dict[str, Uncertainty]:
     return {metric: uncertainty_of(answer) for metric, answer in answers[key].items()}
 
 
-def _is_whole_grid(scores: Scores) -> bool:
+def _is_whole_grid(sigmas: Sequence[Fraction]) -> bool:
     """Whether the sigmas are those of the grid, so that means over them are uncertain too."""
-    sigmas = scores.setting.world.sigmas
     return _has_grid(sigmas) and set(sigmas) == set(SIGMA_GRID)
 
 
