@@ -57,6 +57,8 @@ if TYPE_CHECKING:
 MOST_CURVES, MOST_PAIRS, MOST_BARS, MOST_HISTOGRAMS, MOST_POINTS = 8, 6, 30, 30, 40
 """What one picture holds of curves, rows and histograms, how many pictures of curves and panels of
 datasets there are, and how many points a panel has beside those of the front."""
+EXAMPLES = 12
+"""Histograms that are shown where there are more than one picture holds."""
 MOST_NAMED = 12
 """Trackers of a panel that have a name and a colour, at most, beside those of the front."""
 
@@ -567,7 +569,7 @@ def histograms(view: View) -> Picture | None:
     traces = [trace for trace in view.results.traces if trace["times"]["histogram"]]
     if not traces:
         return None
-    shown = traces[:MOST_HISTOGRAMS]
+    shown = traces if len(traces) <= MOST_HISTOGRAMS else traces[:EXAMPLES]
     left_out = ""
     if len(shown) < len(traces):
         left_out = f"; the first {len(shown)} of {len(traces)} traces"
