@@ -57,8 +57,8 @@ if TYPE_CHECKING:
 MOST_CURVES, MOST_PAIRS, MOST_BARS, MOST_HISTOGRAMS, MOST_POINTS = 8, 6, 30, 30, 40
 """What one picture holds of curves, rows and histograms, how many pictures of curves and panels of
 datasets there are, and how many points a panel has beside those of the front."""
-EXAMPLES = 12
-"""Histograms that are shown where there are more than one picture holds."""
+EXAMPLES, FEW_HISTOGRAMS = 3, 12
+"""Datasets and histograms that are drawn where there are more than the most: as examples."""
 MOST_NAMED = 12
 """Trackers of a panel that have a name and a colour, at most, beside those of the front."""
 
@@ -107,23 +107,38 @@ def _best_runs(view: View, rows: Sequence[SummaryRow]) -> tuple[list[str], str]:
     return kept, left_out
 
 
+def _datasets(view: View) -> list[str]:
+    """Those that are drawn: all, or the first few where they are examples of many."""
+    every = list(dict.fromkeys(row.dataset for row in view.standing))
+    return every if len(every) <= MOST_PAIRS else every[:EXAMPLES]
+
+
+def _of_datasets(view: View) -> str:
+    """Which datasets are drawn, in words, if not all are."""
+    count, drawn = len({row.dataset for row in view.standing}), len(_datasets(view))
+    return f"; the first {drawn} of {count} datasets" if drawn < count else ""
+
+
 def curves(view: View) -> Iterator[Picture]:
     """Success and precision of each dataset, at the settings that stand for all, then others."""
-    groups = _curve_groups(view)
-    for scores, left_out in groups[:MOST_PAIRS]:
+    groups, count = _curve_groups(view)
+    for scores, left_out in groups:
         rows = [view.row_of(each) for each in scores]
         yield Picture(
             f"{visible(rows[0].dataset)}: {_recorded(rows)}{left_out}. In brackets: AUC, "
             "and precision at 20 px.",
             partial(draw_curves, [curve for each in scores for curve in _curves(view, each)]),
         )
-    if len(groups) > MOST_PAIRS:
-        left = len(groups) - MOST_PAIRS
+    if left := count - len(groups):
         yield Picture(f"{left} more settings are in the ranking, and not drawn here.")
 
 
-def _curve_groups(view: View) -> list[tuple[list[Scores], str]]:
-    """Scores whose curves are drawn together, and what was left out; what stands for all first."""
+def _curve_groups(view: View) -> tuple[list[tuple[list[Scores], str]], int]:
+    """Scores whose curves are drawn together, and what was left out of them; of how many groups.
+
+    What stands for all is first.
+    """
+    datasets = _datasets(view)
     groups: dict[tuple[Any, ...], list[Scores]] = {}
     for scores in view.results.scores:
         if scores.about[0]["curves"]["success"] is not None:  # something was scored
@@ -132,10 +147,11 @@ def _curve_groups(view: View) -> list[tuple[list[Scores], str]]:
         groups.values(), key=lambda group: not any(view.stands(view.row_of(s)) for s in group)
     )
     chosen = []
-    for group in ordered:
+    shown = [group for group in ordered if group[0].source.metadata.dataset in datasets]
+    for group in shown[:MOST_PAIRS]:
         kept, left_out = _best_runs(view, [view.row_of(scores) for scores in group])
         chosen.append(([scores for scores in group if scores.setting.run in kept], left_out))
-    return chosen
+    return chosen, len(groups)
 
 
 def _recorded(rows: Sequence[SummaryRow]) -> str:
@@ -189,9 +205,12 @@ def _sweep(view: View, key: str) -> tuple[str, list[Panel]]:
     if len({x for x, _ in points}) < 2:
         return "", []
     caption = f"Over {SWEEPS[key].split(' (')[0]}: {shared_setting(view.standing, but=varied)}"
+    caption += _of_datasets(view)
     panels: list[Panel] = []
-    for dataset in dict.fromkeys(row.dataset for _, row in points):
+    for dataset in _datasets(view):
         within = [(x, row) for x, row in points if row.dataset == dataset]
+        if not within:
+            continue
         kept, left_out = _best_runs(view, [row for _, row in within])
         caption += left_out and f"{left_out} on {_short(dataset)}"
         shown = [(x, row) for x, row in within if run_of(row) in kept]
@@ -247,19 +266,23 @@ def front(view: View) -> Picture | None:
     points = _points(view)
     if not points:
         return None
-    left_out = _left_out(view, points)
-    return Picture(
-        f"{_front_caption(points)}{left_out}", partial(_draw_fronts, _fronts(view, points))
-    )
+    fronts = _fronts(view, points)
+    caption = f"{_front_caption(points)}{_left_out(view, points)}{_grey(fronts)}"
+    return Picture(caption, partial(_draw_fronts, fronts))
+
+
+def _grey(fronts: Iterable[Front]) -> str:
+    """That some trackers have no name, in words."""
+    some = any(not mark.name for front in fronts for mark in front.marks)
+    return "; grey: others, without their names" if some else ""
 
 
 def _left_out(view: View, points: Sequence[Point]) -> str:
     """What of a study is not drawn as points, in words."""
-    datasets, drawn = ({row.dataset for row in some} for some in
-                       (view.standing, [point.row for point in points]))  # fmt: skip
-    said = f"; the first {len(drawn)} of {len(datasets)} datasets" if drawn < datasets else ""
+    drawn = {point.row.dataset for point in points}
     within = sum(row.dataset in drawn for row in view.standing)
-    return said + (f"; the best of {within:,}, and the fronts" if len(points) < within else "")
+    said = f"; the best of {within:,}, and the fronts" if len(points) < within else ""
+    return _of_datasets(view) + said
 
 
 def _points(view: View) -> list[Point]:
@@ -269,7 +292,7 @@ def _points(view: View) -> list[Point]:
         if row.elapsed_ms is not None and (auc := row.score("auc")) is not None:
             datasets.setdefault(row.dataset, []).append(Point(row, row.elapsed_ms, auc))
     chosen: list[Point] = []
-    for points in [*datasets.values()][:MOST_PAIRS]:
+    for points in (datasets[name] for name in _datasets(view) if name in datasets):
         least = sorted((point.auc for point in points), reverse=True)[:MOST_POINTS][-1]
         chosen += [point for point in points if point.row.pareto or point.auc >= least]
     return chosen
@@ -569,7 +592,7 @@ def histograms(view: View) -> Picture | None:
     traces = [trace for trace in view.results.traces if trace["times"]["histogram"]]
     if not traces:
         return None
-    shown = traces if len(traces) <= MOST_HISTOGRAMS else traces[:EXAMPLES]
+    shown = traces if len(traces) <= MOST_HISTOGRAMS else traces[:FEW_HISTOGRAMS]
     left_out = ""
     if len(shown) < len(traces):
         left_out = f"; the first {len(shown)} of {len(traces)} traces"
@@ -593,7 +616,7 @@ def _histograms(traces: Sequence[tuple[str, Mapping[str, Any]]]) -> Figure:
 
 def study_in_columns(view: View) -> Iterator[ColumnFigure]:
     """The figures of a study for a paper, at the settings that stand for all."""
-    for scores, left_out in _curve_groups(view)[:MOST_PAIRS]:
+    for scores, left_out in _curve_groups(view)[0]:
         rows = [view.row_of(each) for each in scores]
         if not any(map(view.stands, rows)):
             break
@@ -623,7 +646,7 @@ def study_in_columns(view: View) -> Iterator[ColumnFigure]:
         [drawn] = _fronts(view, within)
         yield ColumnFigure(
             f"front-{dataset}",
-            f"{visible(dataset)}: {_front_caption(within)}",
+            f"{visible(dataset)}: {_front_caption(within)}{_grey([drawn])}",
             partial(column_figure, partial(draw_front, front=drawn), 2.4),
         )
     caption, rows, runs = _gaining(view)

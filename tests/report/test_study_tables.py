@@ -21,6 +21,7 @@ from lae_sim.figures.study import (
     front,
     gains,
     study_in_columns,
+    sweep,
 )
 from lae_sim.figures.style import GREY
 from lae_sim.replay.world import SIGMA_GRID
@@ -239,6 +240,22 @@ def test_of_many_trackers_the_front_names_the_best_and_shows_the_others_in_grey(
     [others] = [line for line in axes.lines if len(line.get_xdata()) == 40 - MOST_NAMED]
     assert others.get_color() == GREY
     assert set(others.get_xdata()) == {ms for run, (ms, *_) in ends.items() if run not in named}
+
+
+def test_of_many_datasets_a_few_are_drawn_and_the_captions_say_so(results):
+    many = tuple(
+        dataclasses.replace(row, trace=f"T{i}", times_from=f"T{i}", dataset=f"D{i}")
+        for i in range(20)
+        for row in results.summary
+    )
+    view = View(dataclasses.replace(results, summary=many))
+    drawing = front(view)
+    assert "; the first 3 of 20 datasets" in drawing.caption
+    assert [axes.get_title() for axes in drawing.draw().axes] == ["D0", "D1", "D2"]
+    over_scale = sweep(view, "scale")
+    assert "; the first 3 of 20 datasets" in over_scale.caption
+    assert len(over_scale.draw().axes) == 2 * 3
+    assert front(View(results)).caption.count("datasets") == 0
 
 
 def test_gains_are_where_the_summary_has_them(results):
