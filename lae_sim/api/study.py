@@ -141,7 +141,8 @@ def write_views(
     view = View(results)
     sections, figures = page_sections(view, root), [*study_in_columns(view)]
     pictures = page_drawings(sections)
-    jobs = [*(partial(drawn, figure) for figure in figures), *pictures.values()]
+    jobs: list[Callable[[], Any]] = [partial(drawn, figure) for figure in figures]
+    jobs += pictures.values()
     with _being_done(jobs, run) as done:
         tables, frames = paper_tables(view), {"scores": view.results.scores_frame()}
         made = done()

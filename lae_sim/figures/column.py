@@ -133,6 +133,8 @@ def column_files(figure: Figure) -> dict[str, bytes]:
     with matplotlib.rc_context(settings), any_names(figure):
         laid_out(figure)  # once for both
         nothing = dict.fromkeys(("CreationDate", "Creator", "Producer"))
-        FigureCanvasPdf(figure).print_pdf(pdf, metadata=nothing)
-        FigureCanvasSVG(figure).print_svg(svg, metadata=dict.fromkeys(("Date", "Creator")))
+        canvas: Any = FigureCanvasPdf(figure)
+        canvas.print_pdf(pdf, metadata=nothing)
+        canvas = FigureCanvasSVG(figure)
+        canvas.print_svg(svg, metadata=dict.fromkeys(("Date", "Creator")))
     return {"pdf": pdf.getvalue(), "svg": svg.getvalue()}

@@ -233,5 +233,6 @@ def svg_of(figure: Figure) -> bytes:
     settings: dict[Any, Any] = {"svg.hashsalt": "lae_sim", "svg.fonttype": "none"}
     with matplotlib.rc_context(settings), any_names(figure):
         laid_out(figure)
-        FigureCanvasSVG(figure).print_svg(file, metadata=dict.fromkeys(("Date", "Creator")))
+        canvas: Any = FigureCanvasSVG(figure)
+        canvas.print_svg(file, metadata=dict.fromkeys(("Date", "Creator")))
     return file.getvalue()
