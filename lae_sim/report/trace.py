@@ -160,7 +160,9 @@ def _power(provenance: Mapping[str, Any]) -> list[str]:
         table = Table.of(columns, rails)
         lines += ["", *text_of(table).splitlines(), *_joules(energy)]
     # another program may have written anything there
-    clocks = gathered(mhz=lambda: {k: f"{v:,.0f}" for k, v in provenance["device"]["clocks"].items()})
+    clocks = gathered(
+        mhz=lambda: {k: f"{v:,.0f}" for k, v in provenance["device"]["clocks"].items()}
+    )
     for name, mhz in clocks.get("mhz", {}).items():
         lines.append(f"{_words(name.removesuffix('_mhz').upper())} at {mhz} MHz during the calls")
     return ["", *lines] if lines and energy is None else lines

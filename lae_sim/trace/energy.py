@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+
 @dataclass(frozen=True, kw_only=True)
 class Energy:
     """The power of a device during the calls of a tracker, but for initialisations.
@@ -43,7 +44,13 @@ class Energy:
                 idle_w=_numbers(said.get("idle_w", {})),
                 total=[str(name) for name in said["total"]],
             )
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):  # another program wrote it
+        except (
+            KeyError,
+            TypeError,
+            ValueError,
+            AttributeError,
+            OverflowError,
+        ):  # another program wrote it
             return None
         return energy if energy.calls > 0 and energy.power_w else None
 

@@ -37,8 +37,13 @@ def eventually(true: Callable[[], bool], seconds: float = 20) -> bool:
 
 def alive(file: Path) -> bool:
     """Whether the process runs whose number a command wrote into a file."""
-    return Path(f"/proc/{file.read_text().strip()}").exists() if sys.platform == "linux" else (
-        subprocess.run(["ps", "-p", file.read_text().strip()], capture_output=True).returncode == 0
+    return (
+        Path(f"/proc/{file.read_text().strip()}").exists()
+        if sys.platform == "linux"
+        else (
+            subprocess.run(["ps", "-p", file.read_text().strip()], capture_output=True).returncode
+            == 0
+        )
     )
 
 
@@ -46,9 +51,11 @@ def test_all_that_a_command_started_ends(tmp_path: Path) -> None:
     inner, outer = tmp_path / "inner", tmp_path / "outer"
     nested = f"sh -c 'echo $$ >{inner}; sleep 100' & echo $$ >{outer}; wait"
     with Loads([nested, "sleep 100"]) as loads:
-        assert alive(inner) and alive(outer)
+        assert alive(inner)
+        assert alive(outer)
         assert [each["exit"] for each in loads.entries()] == [None, None]
-    assert not alive(inner) and not alive(outer)
+    assert not alive(inner)
+    assert not alive(outer)
     assert [each["exit"] for each in loads.entries()] == [None, None]  # none ended by itself
     assert loads.ended() == []
 
@@ -64,7 +71,9 @@ def test_one_that_does_not_listen_is_killed(tmp_path: Path) -> None:
 
 def test_one_that_tidies_up_has_time_to(tmp_path: Path) -> None:
     tidy = tmp_path / "tidy"
-    with Loads([f"trap 'sleep 0.2; echo done >{tidy}; exit' TERM; while true; do sleep 0.01; done"]):
+    with Loads(
+        [f"trap 'sleep 0.2; echo done >{tidy}; exit' TERM; while true; do sleep 0.01; done"]
+    ):
         pass
     assert tidy.read_text() == "done\n"
 
@@ -95,7 +104,8 @@ def test_one_that_ends_early_is_told(tmp_path: Path) -> None:
         assert eventually(lambda: loads.entries()[0]["exit"] == 7)
         assert loads.entries()[1]["exit"] is None
     (said,) = loads.ended()
-    assert "ended by itself after" in said and "(status 7)" in said
+    assert "ended by itself after" in said
+    assert "(status 7)" in said
 
 
 def test_what_a_load_prints_is_not_kept_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,7 +129,9 @@ def test_parts_of_a_profile_add_up() -> None:
 
 def test_a_profile_beside_two_loads(tmp_path: Path) -> None:
     flag, file = tmp_path / "ran", tmp_path / "load"
-    loud = f"echo noise; echo noise >&2; echo $$ >{file}; while true; do touch {flag}; sleep 0.1; done"
+    loud = (
+        f"echo noise; echo noise >&2; echo $$ >{file}; while true; do touch {flag}; sleep 0.1; done"
+    )
     done = run_here(
         "profile", "--sequence", "race", "--in-process", "--out", "t.parquet", "--json",
         "--beside", loud, "sleep 100", cwd=tmp_path,
@@ -127,7 +139,8 @@ def test_a_profile_beside_two_loads(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "noise" not in done.stdout + done.stderr
     assert json.loads(done.stdout)["failures"] == []
-    assert flag.exists() and not alive(file)
+    assert flag.exists()
+    assert not alive(file)
     loads = read_trace(tmp_path / "t.parquet").metadata.document["device"]["beside"]
     known = {"exit": None, "seconds": None, "sequences": 1, "of_sequences": 1}
     assert loads == [{"command": loud, **known}, {"command": "sleep 100", **known}]

@@ -86,7 +86,8 @@ def test_joules_are_watts_times_the_times_of_the_trace(
     device.slow = 1.0
     (trace,), said = profiled(root, tmp_path / "t.parquet", {})
     energy = Energy.of(trace.metadata.document)
-    assert energy is not None and said == ""
+    assert energy is not None
+    assert said == ""
     assert (energy.power_w, energy.idle_w) == (
         {"VDD_IN": 8.0, "VDD_SOC": 1.0},
         {"VDD_IN": 3.0, "VDD_SOC": 1.0},
@@ -122,7 +123,8 @@ def test_each_pass_has_its_own_but_restarts_have_none(
     assert [each.calls for each in every if each] == [2 * (LENGTH - 1)] * 2
     closed = found["real-time", "1"]
     # the times are those of another device, the energy is that of this one
-    assert closed is not None and closed.watts == 8
+    assert closed is not None
+    assert closed.watts == 8
     assert closed.seconds < 0.047 * closed.calls
 
 
@@ -142,7 +144,8 @@ def test_a_resumed_profile_has_the_energy_of_both_runs(
     first, second = (
         trace.metadata.document["sequences"][name]["sampled"]["seconds"] for name in "ab"
     )
-    assert energy is not None and energy.seconds == pytest.approx(first + second)
+    assert energy is not None
+    assert energy.seconds == pytest.approx(first + second)
     weights = np.array([first, second]) / (first + second)
     assert energy.watts == pytest.approx(weights @ [8, 6], abs=1e-5)
     assert energy.idle_watts == pytest.approx(weights @ [3, 2], abs=1e-5)
@@ -156,7 +159,8 @@ def test_a_sensor_that_fails_midway_says_so_and_ends_nothing(
             device.watts = None
 
     (trace,), said = profiled(root, tmp_path / "t.parquet", {}, progress=fail)
-    assert "VDD_IN: " in said and "readings failed: it says nothing of these" in said
+    assert "VDD_IN: " in said
+    assert "readings failed: it says nothing of these" in said
     document = trace.metadata.document
     assert document["device"]["unread"]["VDD_IN"] > 0
     assert document["device"]["energy"]["power_w"]["VDD_IN"] == 8

@@ -108,35 +108,35 @@ class FakeNvml:
     """An NVML of one GPU; what is None is not supported."""
 
     def __init__(self, millijoules: int | None, milliwatts: int = 75_500) -> None:
-        self.millijoules, self.milliwatts, self.reasons = millijoules, milliwatts, 0x24
         self.asked: list[Any] = []
+        self._answers = {
+            "TotalEnergyConsumption": (ctypes.c_ulonglong, millijoules),
+            "PowerUsage": (ctypes.c_uint, milliwatts),
+            "ClockInfo": (ctypes.c_uint, 1410),
+            "CurrentClocksThrottleReasons": (ctypes.c_ulonglong, 0x24),
+        }
 
-    def nvmlDeviceGetHandleByIndex_v2(self, index: int, device: Any) -> int:
-        self.asked.append(index)
-        return 0 if index < 2 else 6
+    def __getattr__(self, name: str) -> Any:
+        question = name.removeprefix("nvmlDeviceGet")
+        if question in ("HandleByIndex_v2", "HandleByUUID"):
+            return self._handle
+        kind, value = self._answers[question]
+        is_clock = question == "ClockInfo"
 
-    def nvmlDeviceGetHandleByUUID(self, uuid: bytes, device: Any) -> int:
-        self.asked.append(uuid)
-        return 0 if uuid == b"GPU-1" else 6
+        def answer(device: Any, *arguments: Any) -> int:
+            *which, pointer = arguments
+            assert isinstance(pointer._obj, kind)
+            assert [each.value for each in which] == [1] * is_clock  # of the streaming cores
+            if value is None:
+                return 3
+            pointer._obj.value = value
+            return 0
 
-    def _answer(self, value: int | None, pointer: Any) -> int:
-        if value is None:
-            return 3
-        pointer._obj.value = value
-        return 0
+        return answer
 
-    def nvmlDeviceGetTotalEnergyConsumption(self, device: Any, pointer: Any) -> int:
-        assert isinstance(pointer._obj, ctypes.c_ulonglong)
-        return self._answer(self.millijoules, pointer)
-
-    def nvmlDeviceGetPowerUsage(self, device: Any, pointer: Any) -> int:
-        return self._answer(self.milliwatts, pointer)
-
-    def nvmlDeviceGetClockInfo(self, device: Any, kind: Any, pointer: Any) -> int:
-        return self._answer(1410 if kind.value == 1 else None, pointer)
-
-    def nvmlDeviceGetCurrentClocksThrottleReasons(self, device: Any, pointer: Any) -> int:
-        return self._answer(self.reasons, pointer)
+    def _handle(self, which: Any, device: Any) -> int:
+        self.asked.append(which)
+        return 0 if which in (0, 1, b"GPU-1") else 6
 
 
 def test_a_gpu_tells_its_energy_its_clock_and_why_it_slows_down(

@@ -34,15 +34,19 @@ def test_the_energy_of_a_call() -> None:
 
 def test_parts_make_the_device_only_together() -> None:
     both = of(total=["VDD_IN", "VDD_SOC"])
-    assert both is not None and (both.watts, both.idle_watts) == (11.0, 6.5)
+    assert both is not None
+    assert (both.watts, both.idle_watts) == (11.0, 6.5)
     one_failed = of(total=["VDD_IN", "GPU"])
-    assert one_failed is not None and one_failed.joules_per_frame is None
+    assert one_failed is not None
+    assert one_failed.joules_per_frame is None
     no_rest = of(idle_w={})
-    assert no_rest is not None and no_rest.joules_above_idle is None
+    assert no_rest is not None
+    assert no_rest.joules_above_idle is None
     assert "idle_w" not in no_rest.entry()
     assert "joules_per_frame_above_idle" not in no_rest.entry()
     nothing = of(total=[])
-    assert nothing is not None and nothing.watts is None
+    assert nothing is not None
+    assert nothing.watts is None
 
 
 JSON = st.recursive(
