@@ -259,6 +259,7 @@ def compute_study(
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Callable[[str, int, int], object] = lambda what, done, total: None,
+    then: Callable[[StudyResults, RunAll], object] = lambda results, run: None,
 ) -> StudyResults:
     """Compute what is not yet finished, and sum up.
 
@@ -270,6 +271,7 @@ def compute_study(
         scheduler: address of a Dask cluster to compute on instead, such as ``tcp://host:8786``;
             its workers must see the traces under the same paths.
         progress: told what is going on, how much of it is done, and of how much.
+        then: what is done in the end, with the results and the workers of this machine.
 
     Raises:
         LaeError: if the study cannot be planned, nothing could be computed, or a worker died.
@@ -280,7 +282,7 @@ def compute_study(
     check_inputs(folder, [*(source.input.path for source in plan.sources), *files])
     store = Store(folder)
     with store.locked():
-        return _run(plan, store, workers, scheduler, progress)
+        return _run(plan, store, workers, scheduler, progress, then)
 
 
 def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathLike[str]]) -> None:
@@ -309,6 +311,7 @@ def _run(
     workers: int | None,
     scheduler: str | None,
     progress: Callable[[str, int, int], object],
+    then: Callable[[StudyResults, RunAll], object],
 ) -> StudyResults:
     study = plan.study
     store.prepare(plan.cells)
@@ -345,29 +348,32 @@ def _run(
         progress("summing up", len(pieces), len(pieces))
         answers = Answers(store.document(ANSWERS))
         summary = tuple(summarise_study(scores, study.seed, answers=answers, run=run))
-    if answers.differ:
-        store.keep(ANSWERS, answers.document())
-    curves = ((search, store.document(search.key)) for search in asked)
-    results = StudyResults(
-        folder=store.folder,
-        plan=plan,
-        scores=scores,
-        summary=summary,
-        comparisons=compared[0],
-        pairs=compared[1],
-        required=tuple(
-            requirement(search, Curve(**curve), auc)
-            for search, curve in curves
-            if curve
-            for auc in search.required
-        ),
-        traces=Documents(store.document, [each.key for each in described if store.holds(each.key)]),
-        computed=computed,
-        failures=tuple(sorted(failures, key=lambda failure: str(failure.flat()))),
-        training=tuple(training),
-    )
-    _write(results, store)
-    return results
+        if answers.differ:
+            store.keep(ANSWERS, answers.document())
+        curves = ((search, store.document(search.key)) for search in asked)
+        results = StudyResults(
+            folder=store.folder,
+            plan=plan,
+            scores=scores,
+            summary=summary,
+            comparisons=compared[0],
+            pairs=compared[1],
+            required=tuple(
+                requirement(search, Curve(**curve), auc)
+                for search, curve in curves
+                if curve
+                for auc in search.required
+            ),
+            traces=Documents(
+                store.document, [each.key for each in described if store.holds(each.key)]
+            ),
+            computed=computed,
+            failures=tuple(sorted(failures, key=lambda failure: str(failure.flat()))),
+            training=tuple(training),
+        )
+        _write(results, store)
+        then(results, run_here if scheduler else run)
+        return results
 
 
 def _keep(batch: Batch, done: Done, store: Store, failures: list[Failure]) -> int:
