@@ -1,6 +1,7 @@
 """The scheduler: which frames a busy tracker processes, and when its outputs are ready.
 
-This is the only scheduler in the package. A *service* says how long a frame takes (a live tracker
+This is the scheduler of one tracker that takes its frames itself; :mod:`.engine.stages` is that of
+whole pipelines. A *service* says how long a frame takes (a live tracker
 runs and is timed; a recorded one looks the time up), a *policy* says which frame is next, and
 SimPy moves the clock. See Li et al., "Predictive Visual Tracking" (2021), Eqs. 3 and 4.
 """
@@ -43,6 +44,10 @@ from the arrival of their own frames (see :class:`Schedule`).
 """
 
 
+NEVER = 2**62
+"""A tick that never comes."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Schedule:
     """What one sequence's processing looked like, in processing order.
@@ -55,6 +60,9 @@ class Schedule:
         ready: when each output became available, int64 [n], ticks.
         scores_latency: whether an output counts only once it is ready, as the policy has it; False
             under the VOT toolkit's rule, which lets it count from its own frame's arrival.
+        visible: from when each output answers queries, int64 [n], ticks, never decreasing;
+            ``NEVER`` for one that never does. None: from when it is ready. Stages after a tracker
+            make it later (see :class:`.stages.PipelineSchedule`).
     """
 
     clock: Clock
@@ -63,6 +71,7 @@ class Schedule:
     start: Ints
     ready: Ints
     scores_latency: bool = True
+    visible: Ints | None = None
 
     def __repr__(self) -> str:
         processed = f"{len(self.frames):,} of {self.length:,} frames processed"

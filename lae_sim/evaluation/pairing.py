@@ -22,7 +22,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Frames, Ints
 from lae_sim._compiled import compiled
 from lae_sim.engine.clock import MAX_INT64, Clock
-from lae_sim.engine.scheduler import Schedule
+from lae_sim.engine.scheduler import NEVER, Schedule
 from lae_sim.errors import LaeError
 
 MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
@@ -248,7 +248,8 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
     if cost_ns < 0:
         raise LaeError(f"forecasting cannot cost {cost_ns} ns, less than nothing")
     cost = cost_ns * clocks[0].ticks_per_ns
-    last_ready = max(int(schedule.ready[-1]) for schedule in schedules) + cost
+    visible = [s.ready if s.visible is None else s.visible for s in schedules]
+    last_ready = max(int(ticks[ticks < NEVER][-1]) for ticks in visible) + cost
     if last_ready > MAX_INT64:
         raise LaeError(f"forecasting cannot cost {cost_ns:g} ns: the clock ends before")
     largest = max(last_ready // interval, int(lengths.max())) * scale
@@ -262,7 +263,7 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     frames = np.concatenate([schedule.frames for schedule in schedules])
     at_once = scored == {False}
-    if not at_once and any((s.start[1:] < s.ready[:-1]).any() for s in schedules):
+    if not at_once and any(s.visible is None and (s.start[1:] < s.ready[:-1]).any() for s in schedules):
         raise LaeError(
             "calls overlap, as under the rule of VOT, which never scores latency: such a policy "
             "says so by an attribute, scores_latency = False"
@@ -274,8 +275,10 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
         if at_once:
             steps = frames * scale
         else:
-            frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]) + cost, interval)
+            ticks = np.concatenate(visible)
+            frame, rest = np.divmod(ticks + cost, interval)
             steps = frame * scale - (-rest * scale // interval)
+            steps[ticks == NEVER] = _NEVER
         steps[offsets[:-1]] = -_NEVER
         next_steps = np.append(steps[1:], _NEVER)
         next_steps[offsets[1:] - 1] = _NEVER
@@ -287,8 +290,8 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
         since = np.array(permitted, np.int64)
         first = np.concatenate(
             [
-                _first_arrived(s, s.clock.arrival(s.frames) if at_once else s.ready + cost, since)
-                for s in schedules
+                _first_arrived(s, s.clock.arrival(s.frames) if at_once else ticks + cost, since)
+                for s, ticks in zip(schedules, visible)
             ]
         )
     end = np.empty_like(first)
