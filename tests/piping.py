@@ -97,7 +97,9 @@ class Witness:
         self.returning: list[str] = []
         self.pending: dict[tuple[int, int], int] = {}  # (stage, frame): followers not yet entered
         self.order = 0
-        self.due: list[tuple[Fraction, int, int, int]] = []  # when, order, stage (-1: camera), frame
+        self.due: list[
+            tuple[Fraction, int, int, int]
+        ] = []  # when, order, stage (-1: camera), frame
         before = Fraction(0)
         for frame in range(length):
             if frame and frame in piped.lost:
@@ -163,7 +165,12 @@ class Witness:
         for other in following:
             state = self.states[other]
             full = state.stage.queue is not None and len(state.waiting) >= state.stage.queue
-            if full and state.stage.when_full == "block" and frame and not self.refused(other, frame):
+            if (
+                full
+                and state.stage.when_full == "block"
+                and frame
+                and not self.refused(other, frame)
+            ):
                 state.held_up.append((frame, place))
                 kept += 1
             else:

@@ -40,9 +40,10 @@ from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.latency import LatencySource
+from lae_sim.replay.names import label_of, named
 from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import Run, Runs
-from lae_sim.replay.world import TraceLike, World, label_of, named, open_others, open_trace
+from lae_sim.replay.world import TraceLike, World, open_others, open_trace
 from lae_sim.report.replay import SequenceRows, attribute_members, paper_tables, trace_report
 from lae_sim.report.table import FINE_SCORE
 from lae_sim.trace.describe import InitCost

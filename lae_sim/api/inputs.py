@@ -15,7 +15,8 @@ from lae_sim.files import sequence_names
 from lae_sim.forecast.base import Hold, own_factory
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import find_camera
-from lae_sim.replay.world import TraceLike, named, open_trace, several
+from lae_sim.replay.names import named, several
+from lae_sim.replay.world import TraceLike, open_trace
 from lae_sim.trace.file import Trace
 from lae_sim.trace.locate import find_traces
 

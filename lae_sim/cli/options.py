@@ -419,7 +419,8 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
         LaeError: if there is no such policy or latency, or some do not go together.
     """
     from lae_sim.replay.latency import scaled
-    from lae_sim.replay.world import World, parse_latency, parse_policy, several
+    from lae_sim.replay.names import parse_latency, parse_policy, several
+    from lae_sim.replay.world import World
 
     parse_policy(arguments.policy)  # what is wrong with an option is said without its Python name
     for latency, scale in product(several(arguments.latency), several(arguments.latency_scale)):

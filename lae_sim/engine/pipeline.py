@@ -174,9 +174,7 @@ class Pipeline:
         for name, capacity in self.resources.items():
             counted = isinstance(capacity, Integral) and not isinstance(capacity, bool)
             if not counted or capacity < 1:
-                raise LaeError(
-                    f"resources: {name}: {shown(capacity)} is not a whole number from 1"
-                )
+                raise LaeError(f"resources: {name}: {shown(capacity)} is not a whole number from 1")
         for stage in self.stages:
             where = f"stage {stage.name!r}"
             if stage.resource is not None and stage.resource not in self.resources:

@@ -263,7 +263,8 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     frames = np.concatenate([schedule.frames for schedule in schedules])
     at_once = scored == {False}
-    if not at_once and any(s.visible is None and (s.start[1:] < s.ready[:-1]).any() for s in schedules):
+    alone = [schedule for schedule in schedules if schedule.visible is None]
+    if not at_once and any((s.start[1:] < s.ready[:-1]).any() for s in alone):
         raise LaeError(
             "calls overlap, as under the rule of VOT, which never scores latency: such a policy "
             "says so by an attribute, scores_latency = False"

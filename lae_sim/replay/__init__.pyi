@@ -10,6 +10,7 @@ from .latency import (
     resampled,
     scaled,
 )
+from .names import parse_latency, parse_policy
 from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
 from .run import Run, Runs, replay_repeated, replay_sequence
 from .search import Outcomes, SearchModel, find_search
@@ -18,8 +19,6 @@ from .world import (
     SIGMA_GRID,
     TraceLike,
     World,
-    parse_latency,
-    parse_policy,
     parse_sigmas,
     replay_trace,
 )

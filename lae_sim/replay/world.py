@@ -6,29 +6,37 @@ Command lines, study files and keyword arguments all make worlds, through the pa
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
-from lae_sim.engine import policies
-from lae_sim.engine.clock import Clock, Number, exact, parse_fps, split_init, whole
+from lae_sim.engine.clock import Clock, Number, exact, parse_fps
 from lae_sim.engine.scheduler import Policy, scores_latency
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, shown
 from lae_sim.files import sequence_names
 from lae_sim.forecast.base import AnyFactory
-from lae_sim.plugins import bound, imported, with_options
 from lae_sim.replay import latency as sources
 from lae_sim.replay.latency import (
     Constant,
     Initialised,
     LatencySource,
     RandomSource,
-    initialised,
     scaled,
-    time_label,
+)
+from lae_sim.replay.names import (
+    LATENCIES,
+    POLICIES,
+    Plugin,
+    flag,
+    kind_of,
+    label_of,
+    named,
+    parse_latency,
+    parse_policy,
+    several,
+    text,
 )
 from lae_sim.replay.passes import split_passes
 from lae_sim.replay.run import Runs
@@ -53,24 +61,8 @@ TraceLike: TypeAlias = "str | os.PathLike[str] | Trace"
 
 Value = TypeVar("Value")
 
-_POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime")
-_LATENCIES = ("recorded", "by-call", "constant", "resample", "lognormal", "bootstrap")
-
 _TRACE = (str, os.PathLike, Trace)
 _A_TRACE = "a path, a URL or what read_trace gives"
-
-
-@dataclass(frozen=True)
-class Plugin:
-    """A user's own policy or source of times, made once, under the name that asks for it.
-
-    Attributes:
-        label: ``package.module:object``.
-        made: what that is, or an instance of it if it is a class.
-    """
-
-    label: str
-    made: Any = field(compare=False)
 
 
 _PLUGIN: tuple[Any, ...] = (str, Plugin, Callable)
@@ -84,8 +76,10 @@ class World:
         fps: frames that the world shows per second; each trace's own if None.
         forget_arrivals: let frames arrive evenly also where a trace says when each of them arrived,
             which is needed for another rate.
-        policy: which frame a free tracker takes: a name (see :func:`parse_policy`), or a policy.
-        latency: where processing times come from: a name (see :func:`parse_latency`), or a source.
+        policy: which frame a free tracker takes: a policy, or a name of one (see
+            :func:`.names.parse_policy`).
+        latency: where processing times come from: a source, or a name of one (see
+            :func:`.names.parse_latency`).
         scale: exact factor on all times.
         timing: another device's trace of the same sequences, to take the times from.
         passes: traces of the same tracker at other strides, one of which each sequence's boxes
@@ -201,8 +195,8 @@ class World:
         """
         return cls(
             fps=None if fps is None else named("fps", parse_fps, fps),
-            policy=_made("policy", policy, parse_policy, _POLICIES),
-            latency=_made("latency", latency, parse_latency, _LATENCIES),
+            policy=_made("policy", policy, parse_policy, POLICIES),
+            latency=_made("latency", latency, parse_latency, LATENCIES),
             scale=named("scale", _factor, scale),
             timing=timing,
             passes=several(passes),
@@ -234,8 +228,8 @@ class World:
         Raises:
             LaeError: as :meth:`of`, or if there is nothing of one, or two have the same name.
         """
-        rules = [_made("policy", each, parse_policy, _POLICIES) for each in several(policy)]
-        times = [_made("latency", each, parse_latency, _LATENCIES) for each in several(latency)]
+        rules = [_made("policy", each, parse_policy, POLICIES) for each in several(policy)]
+        times = [_made("latency", each, parse_latency, LATENCIES) for each in several(latency)]
         rates = [named("fps", parse_fps, each) for each in several(fps)]
         factors = [named("scale", _factor, each) for each in several(scale)]
         swept: dict[str, list[Any]] = {
@@ -401,76 +395,6 @@ def open_others(
     }
 
 
-def parse_policy(text: str) -> Policy:
-    """A policy by name.
-
-    A user's own is named ``package.module:object``: a policy, or a class that makes one; parameters
-    may follow, as in ``mine:Patient:frames=2``.
-
-    Raises:
-        LaeError: if there is none of that name, or its value does not fit.
-    """
-    name, colon, value = text.partition(":")
-    if text == "latest":
-        return policies.latest
-    if text == "fifo":
-        return policies.fifo
-    if name == "every":
-        return policies.every(_number(text, value, least=1))
-    if name == "shrinking-tail" and value:
-        return policies.shrinking_tail(value)
-    if name == "vot-realtime":
-        return policies.vot_realtime(*([_number(text, value)] if value else []))
-    if colon and name not in ("latest", "fifo", "shrinking-tail"):
-        policy: Policy = _plugin("policy", text, _POLICIES, ("clock", "calls"))
-        return policy
-    raise LaeError(
-        f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
-        f"vot-realtime[:GRACE], package.module:object{hint(name, _POLICIES)}"
-    )
-
-
-def parse_latency(text: str) -> LatencySource:
-    """A latency source by name.
-
-    A user's own is named ``package.module:object``: a source, or a class that makes one; parameters
-    may follow, as in ``mine:Jitter:ms=40,seed=3``. Every name may end in ``,init=TIME``, what the
-    initialisation takes: ``constant:47ms,init=800ms``.
-
-    Raises:
-        LaeError: if there is none of that name, or its value does not fit.
-    """
-    text, init_ns = split_init(text)
-    if init_ns is not None:
-        return initialised(parse_latency(text), init_ns)
-    name, colon, value = text.partition(":")
-    if text == "recorded":
-        return sources.by_frame
-    if text == "by-call":
-        return sources.by_call
-    if name == "constant":
-        return sources.constant(value)
-    if name == "resample":
-        return sources.resampled(_number(text, value))
-    if name == "lognormal":
-        return sources.lognormal(_number(text, value))
-    if name == "bootstrap":
-        seed, *block = value.split(":", 1)
-        return sources.bootstrap(_number(text, seed), *(_number(text, n, least=1) for n in block))
-    if colon and name not in ("recorded", "by-call"):
-        source: LatencySource = _plugin("latency", text, _LATENCIES, ("recording",))
-        return source
-    meant = hint(name, _LATENCIES)
-    if text[:1].isdigit():
-        unit = "" if text[-1:].isalpha() else "ms"
-        meant = f"; did you mean constant:{text:.40}{unit}?"
-    raise LaeError(
-        f"no latency {shown(text)}: there are recorded, by-call, constant:47ms, resample:SEED, "
-        f"lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object, all of them perhaps with "
-        f",init=TIME{meant}"
-    )
-
-
 def parse_sigmas(value: Number | Iterable[Number]) -> tuple[Fraction, ...]:
     """Permitted latencies in ascending order: one, several, or ``"grid"``.
 
@@ -492,51 +416,6 @@ def check_sigmas(sigmas: tuple[Fraction, ...]) -> None:
         raise LaeError("sigma: name at least one permitted latency, such as 0 or 'grid'")
     if list(sigmas) != sorted(set(sigmas)):
         raise LaeError("sigma: permitted latencies must be ascending, each of them once")
-
-
-def several(value: Any) -> tuple[Any, ...]:
-    """One value, or several, as a tuple; None is none. Text, a trace, a function are one value."""
-    if value is None:
-        return ()
-    one = isinstance(value, (str, bytes, os.PathLike, Trace)) or not isinstance(value, Iterable)
-    return (value,) if one else tuple(value)
-
-
-def text(value: Any) -> str:
-    """Text that is not empty.
-
-    Raises:
-        LaeError: if the value is none.
-    """
-    if not isinstance(value, str) or not value:
-        own = ": name your own as 'package.module:object'" if callable(value) else ""
-        raise LaeError(f"{shown(value)} is not text{own}")
-    return value
-
-
-def flag(value: Any) -> bool:
-    """True or false.
-
-    Raises:
-        LaeError: if the value is neither.
-    """
-    if not isinstance(value, bool):
-        raise LaeError(f"{shown(value)} is neither true nor false")
-    return value
-
-
-def named(name: str, parse: Callable[[Any], Value], value: Any) -> Value:
-    """What a parser makes of an argument's value.
-
-    Raises:
-        LaeError: what the parser raises, with the argument's name.
-    """
-    try:
-        return parse(value)
-    except LaeError as error:
-        if str(error).startswith(f"{name}: "):
-            raise
-        raise type(error)(f"{name}: {error}") from error
 
 
 def _made(name: str, given: Any, parse: Callable[[str], object], known: Iterable[str]) -> Any:
@@ -564,47 +443,6 @@ def _factor(value: Number) -> Fraction:
     if factor < 0:
         raise LaeError(f"times cannot be scaled by {factor}, below zero")
     return factor
-
-
-def label_of(plugin: object) -> str:
-    """The name of a policy or a source of times in tables."""
-    if isinstance(plugin, str):
-        return plugin
-    if isinstance(plugin, Initialised):
-        return f"{label_of(plugin.source)},init={time_label(plugin.init_ns)}"
-    own = {id(sources.by_frame): "recorded", id(sources.by_call): "by-call"}.get(id(plugin))
-    label = own or getattr(plugin, "label", None) or getattr(plugin, "__name__", None)
-    return str(label or type(plugin).__name__)
-
-
-def kind_of(label: str) -> str:
-    """What kind of policy or source a label names: all before its values, as ``"constant"``."""
-    return re.split("[:,]", label, maxsplit=1)[0]
-
-
-def _plugin(what: str, text: str, known: Iterable[str], arguments: Sequence[str]) -> Any:
-    """What a user made, or an instance of it if it is a class, with options; checked.
-
-    Args:
-        what: what it is.
-        text: its name.
-        known: what else may have been meant.
-        arguments: names of those that it will be called with.
-    """
-    try:
-        made, options = imported(f"{what} {text!r}", text)
-    except LaeError as error:
-        raise LaeError(f"{error}{hint(text.partition(':')[0], known)}") from error
-    if isinstance(made, type):
-        made, options = bound(f"{what} {text!r}", made, [], options), {}
-    return with_options(f"{what} {text!r}", made, options, arguments)
-
-
-def _number(text: str, value: str, least: int = 0) -> int:
-    try:
-        return whole(value, least)
-    except LaeError as error:
-        raise LaeError(f"{text!r} needs a whole number from {least} after the colon") from error
 
 
 def _check_kinds(name: str, values: Iterable[object], kinds: tuple[Any, ...], what: str) -> None:

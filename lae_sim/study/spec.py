@@ -19,18 +19,17 @@ from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.plugins import looking_in
-from lae_sim.replay.search import parse_search
-from lae_sim.replay.world import (
-    check_sigmas,
+from lae_sim.replay.names import (
     flag,
     kind_of,
     named,
     parse_latency,
     parse_policy,
-    parse_sigmas,
     several,
     text,
 )
+from lae_sim.replay.search import parse_search
+from lae_sim.replay.world import check_sigmas, parse_sigmas
 from lae_sim.trace.file import Trace
 
 RANDOM = ("bootstrap", "resample", "lognormal")

@@ -53,7 +53,9 @@ def pipeline_of(world: Piped) -> Pipeline:
         )
         for stage in world.stages
     ]
-    camera = Camera(exposure=f"{world.delay // 2}ns", delivery=f"{world.delay - world.delay // 2}ns")
+    camera = Camera(
+        exposure=f"{world.delay // 2}ns", delivery=f"{world.delay - world.delay // 2}ns"
+    )
     return Pipeline(stages, camera, world.resources)
 
 
@@ -130,9 +132,7 @@ def same_calls(a: Schedule, b: Schedule) -> bool:
 )
 @given(arriving())
 @settings(max_examples=150)
-def test_one_stage_is_a_policy_tick_for_tick(
-    policy: Policy, stage: Stage, world: Arriving
-) -> None:
+def test_one_stage_is_a_policy_tick_for_tick(policy: Policy, stage: Stage, world: Arriving) -> None:
     length, times = len(world.arrival_ns), world.elapsed_ns.__getitem__
     for clock in (Clock.at(world.fps), with_arrivals(Clock.at(world.fps), world.arrival_ns)):
         schedule = simulate_pipeline(Pipeline([stage]), length, clock, {"tracker": times})
@@ -172,7 +172,9 @@ def test_the_more_urgent_gets_the_resource_at_the_tick_when_it_comes_back() -> N
     # the tracker's frame 0 and decode's frame 1 want it at 40 ms
     assert ms(schedule.start)[:2] == [40, 120]
     assert ms(schedule.stages["decode"].started)[:2] == [0, 80]
-    even = Pipeline([Stage("decode", resource="gpu"), Stage("tracker", resource="gpu")], resources={"gpu": 1})
+    even = Pipeline(
+        [Stage("decode", resource="gpu"), Stage("tracker", resource="gpu")], resources={"gpu": 1}
+    )
     assert ms(simulate_pipeline(even, 4, CLOCK, constant(decode=40, tracker=40)).start)[0] == 80
 
 
@@ -228,6 +230,18 @@ def test_what_overtakes_the_initialisation_is_dropped() -> None:
     assert schedule.frames.tolist() == [0, 3, 4]
     dropped = schedule.stages["tracker"].dropped.tolist()
     assert dropped[1:3] == [Drop.TOO_EARLY, Drop.TOO_EARLY]
+
+
+def test_a_full_queue_lets_the_initialisation_in() -> None:
+    stages = [Stage("decode", workers=3), Stage("scale", when_full="block"), Stage("tracker")]
+    services = {
+        "decode": lambda frame: (1 if frame else 100) * MS,
+        **constant(scale=60, tracker=1),
+    }
+    schedule = simulate_pipeline(Pipeline(stages), 5, CLOCK, services)
+    scale = schedule.stages["scale"]
+    assert ms(scale.arrived)[:3] == [100, 41, 81]
+    assert ms(scale.taken)[:3] == [101, 41, 161]
 
 
 @pytest.mark.parametrize(

@@ -31,8 +31,8 @@ from lae_sim.replay.latency import (
     resampled,
     scaled,
 )
+from lae_sim.replay.names import label_of
 from lae_sim.replay.run import replay_sequence
-from lae_sim.replay.world import label_of
 from lae_sim.trace.recording import Recording
 
 TIMES = [90, -1, 20, 30, -1, 50]

@@ -1,0 +1,309 @@
+"""Pipelines in a replay: read from TOML, and fed with times of recordings.
+
+A pipeline is a TOML file, or a table of a study::
+
+    [camera]
+    exposure = "4ms"
+    delivery = "3ms"
+    jitter = "uniform:0ms-8ms:1"
+
+    [resources]
+    gpu = 1
+
+    [[stages]]
+    name = "decode"
+    time = "6ms"
+
+    [[stages]]
+    name = "tracker"
+    resource = "gpu"
+
+with the attributes of :class:`.Pipeline`, :class:`.Camera` and :class:`.Stage` as keys.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lae_sim.decoding import read_toml
+from lae_sim.engine.clock import Clock, exact, parse_duration, whole
+from lae_sim.engine.pipeline import CAMERA, Camera, Pipeline, Stage, TimeSource
+from lae_sim.engine.scheduler import Service
+from lae_sim.engine.stages import PipelineSchedule, simulate_pipeline
+from lae_sim.errors import LaeError, hint, listed, shown
+from lae_sim.plugins import looking_in
+from lae_sim.replay.latency import (
+    Constant,
+    Initialised,
+    LatencySource,
+    RandomSource,
+    Uniform,
+    by_call,
+    by_frame,
+    scaled,
+    stream,
+)
+from lae_sim.replay.names import named, parse_latency, text
+from lae_sim.trace.recording import Recording
+
+_RANGE = re.compile(r"([0-9.]+[a-z]+)-([0-9.]+[a-z]+):([0-9]+)\Z")
+_SHARE = re.compile(r"([0-9./]+):([0-9]+)\Z")
+
+
+def read_pipeline(path: str | os.PathLike[str]) -> Pipeline:
+    """Read a pipeline from a TOML file; modules of yours are found in its folder.
+
+    Raises:
+        LaeError: if it cannot be read, is not TOML, or is no valid pipeline; it names the file, the
+            stage and the key.
+
+    Example:
+        >>> import lae_sim
+        >>> lae_sim.read_pipeline("traces/pipeline.toml")
+        <Pipeline 'pipeline': camera > decode > tracker > publish>
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise LaeError(f"pipeline: it is read from a TOML file, not {shown(path)}")
+    document = read_toml(path, "a pipeline")
+    try:
+        with looking_in(Path(path).parent):
+            return parse_pipeline(document, Path(path).stem)
+    except LaeError as error:
+        raise LaeError(f"{path}: {error}") from error
+
+
+def parse_pipeline(document: Mapping[str, Any], name: str = "pipeline") -> Pipeline:
+    """A pipeline from plain values, as TOML or JSON has them.
+
+    Args:
+        document: with the keys ``stages``, and perhaps ``camera``, ``resources``, ``tracker`` and
+            ``name``; a stage's ``queue`` may be ``"unbounded"``.
+        name: of the pipeline, unless it has one of its own.
+
+    Raises:
+        LaeError: if a key is unknown, or a value impossible; it names the stage and the key.
+    """
+    values = dict(_checked("pipeline", document, Pipeline))
+    stages = values.get("stages")
+    if not isinstance(stages, (list, tuple)) or not stages:
+        raise LaeError("stages: a pipeline has at least one: [[stages]], with its name")
+    for key in ("name", "tracker"):
+        if key in values:
+            named(key, text, values[key])
+    resources = values.get("resources", {})
+    if not isinstance(resources, Mapping):
+        raise LaeError(f"resources: a table of whole numbers by name, not {shown(resources)}")
+    values |= {
+        "name": values.get("name", name),
+        "camera": Camera(**_checked("camera", values.get("camera", {}), Camera)),
+        "resources": dict(resources),
+        "stages": [_stage(place, each) for place, each in enumerate(stages, 1)],
+    }
+    pipeline = Pipeline(**values)
+    PipelineTimes.of(pipeline)  # whose names are looked up
+    return pipeline
+
+
+def _checked(what: str, document: Any, kind: type) -> Mapping[str, Any]:
+    """A table whose keys are those of a record.
+
+    Raises:
+        LaeError: if it is none, or has another key.
+    """
+    if not isinstance(document, Mapping):
+        raise LaeError(f"{what}: a table of keys and values, not {shown(document)}")
+    known = [each.name for each in fields(kind)]
+    for key in document:
+        if key not in known:
+            near = hint(key, known) or f": there are {listed(known, 12)}"
+            raise LaeError(f"{what}: unknown key {shown(key)}{near}")
+    return document
+
+
+def _stage(place: int, document: Any) -> Stage:
+    given = document.get("name") if isinstance(document, Mapping) else None
+    where = f"stage {given!r}" if isinstance(given, str) else f"stages: number {place}"
+    values = dict(_checked(where, document, Stage))
+    if "name" not in values:
+        raise LaeError(f"{where}: name: it is missing")
+    if values.get("queue") == "unbounded":
+        values["queue"] = None
+    return Stage(**values)
+
+
+def parse_time(name: str) -> LatencySource:
+    """A source of a stage's times by name: that of a latency, a duration, or a range.
+
+    Args:
+        name: as :func:`.names.parse_latency` takes it; or ``"6ms"``, for ``"constant:6ms"``; or
+            ``"uniform:0ms-8ms:SEED"``, drawn evenly.
+
+    Raises:
+        LaeError: if it is none of these.
+    """
+    kind, _, value = name.partition(":")
+    if kind == "uniform":
+        if (found := _RANGE.match(value)) is None:
+            raise LaeError(f"{name!r}: write uniform:LOW-HIGH:SEED, such as uniform:0ms-8ms:1")
+        return Uniform(parse_duration(found[1]), parse_duration(found[2]), int(found[3]))
+    if name[:1].isdigit() and name[-1:] == "s":
+        return Constant(parse_duration(name))
+    return parse_latency(name)
+
+
+def parse_drops(drops: Any) -> Callable[[Recording], frozenset[int]]:
+    """Which frames a camera loses, as :class:`.Camera` names them.
+
+    Raises:
+        LaeError: if they are neither numbers nor such a name.
+    """
+    if not isinstance(drops, str):
+        numbers = frozenset(named("drops", whole, each) for each in drops)
+        return lambda recording: numbers
+    kind, _, value = drops.partition(":")
+    if kind == "every":
+        return partial(_every, named("drops", partial(whole, least=2), value))
+    if kind == "share" and (found := _SHARE.match(value)):
+        share = named("drops", exact, found[1])
+        if 0 <= share < 1:
+            return partial(_share, share, int(found[2]))
+    raise LaeError(
+        f"drops: {shown(drops)}: write every:N, share:P:SEED with P from 0 to below 1, or a list "
+        "of frames"
+    )
+
+
+def _every(n: int, recording: Recording) -> frozenset[int]:
+    return frozenset(range(n - 1, len(recording), n))
+
+
+def _share(share: Fraction, seed: int, recording: Recording) -> frozenset[int]:
+    words = stream(seed, f"{recording.name}, stage {CAMERA}: drops", 0, len(recording))
+    below = np.uint64(share * 2**64 // 1)
+    return frozenset(np.flatnonzero(words < below).tolist())
+
+
+@dataclass(frozen=True)
+class PipelineTimes:
+    """A pipeline with the sources of its times, found by their names.
+
+    The streams of random sources differ from stage to stage, whatever their seeds.
+
+    Attributes:
+        pipeline: the stages.
+        sources: by stage; that of the tracker only if it is not the world's latency.
+        jitter: of the camera; None for none.
+        lost: the frames of a recording that the camera loses.
+    """
+
+    pipeline: Pipeline
+    sources: Mapping[str, LatencySource] = field(hash=False)
+    jitter: LatencySource | None
+    lost: Callable[[Recording], frozenset[int]]
+
+    @classmethod
+    def of(cls, pipeline: Pipeline, scale: Fraction = Fraction(1)) -> PipelineTimes:
+        """Those of a pipeline, all stages' times scaled by an exact factor; not the camera's.
+
+        Raises:
+            LaeError: if there is no source of a name; it names the stage and the key.
+        """
+        found = {}
+        for stage in pipeline.stages:
+            if stage.time is None and stage.name == pipeline.tracker:
+                continue
+            source = by_frame if stage.time is None else _source(
+                f"stage {stage.name!r}: time", stage.time
+            )
+            found[stage.name] = scaled(source, scale)
+        camera = pipeline.camera
+        jitter = None if camera.jitter is None else _source("camera: jitter", camera.jitter)
+        return cls(pipeline, found, jitter, named("camera", parse_drops, camera.drops))
+
+    def of_tracker(self, recording: Recording) -> Recording:
+        """What the tracker's times are drawn from."""
+        tracker = next(s for s in self.pipeline.stages if s.name == self.pipeline.tracker)
+        return recording if tracker.of is None else _stage_of(recording, tracker.of)
+
+    def schedule(
+        self, recording: Recording, clock: Clock, tracker: Service, repetition: int = 0
+    ) -> PipelineSchedule:
+        """Run the pipeline on a sequence.
+
+        Args:
+            recording: what the times are drawn from.
+            clock: of the sequence.
+            tracker: the tracker's times.
+            repetition: of random sources.
+
+        Raises:
+            LaeError: if the recording lacks a stage's times, or one is impossible.
+        """
+        services: dict[str, Service] = {self.pipeline.tracker: tracker}
+        for stage in self.pipeline.stages:
+            if stage.name != self.pipeline.tracker:
+                source = _repeated(self.sources[stage.name], repetition)
+                times = _named_after(stage.name, recording)
+                if _draws_on_recorded(source):
+                    times = _stage_of(times, stage.of or stage.name, stage.name)
+                services[stage.name] = source(times)
+        jitter = None
+        if self.jitter is not None:
+            times = _named_after(CAMERA, recording)
+            if _draws_on_recorded(self.jitter):
+                times = _stage_of(times, CAMERA, CAMERA)
+            jitter = _repeated(self.jitter, repetition)(times)
+        try:
+            return simulate_pipeline(
+                self.pipeline, len(recording), clock, services, jitter, self.lost(recording)
+            )
+        except LaeError as error:
+            if str(error).startswith("sequence "):
+                raise
+            raise LaeError(f"sequence {recording.name!r}: {error}") from error
+
+
+def _source(what: str, source: TimeSource) -> LatencySource:
+    if isinstance(source, str):
+        return named(what, parse_time, source)
+    if not callable(source):
+        raise LaeError(f"{what}: {shown(source)} is no time, such as '6ms', and no function")
+    return source
+
+
+def _repeated(source: LatencySource, repetition: int) -> LatencySource:
+    if isinstance(source, (RandomSource, Uniform)):
+        return replace(source, repetition=source.repetition + repetition)
+    return source
+
+
+def _draws_on_recorded(source: LatencySource) -> bool:
+    """Whether a source of the package's needs recorded times."""
+    if isinstance(source, Initialised):
+        return _draws_on_recorded(source.source)
+    return source in (by_frame, by_call) or isinstance(source, RandomSource)
+
+
+def _named_after(stage: str, recording: Recording) -> Recording:
+    """A recording under a name of the stage's own, for messages, and for streams of its own."""
+    return replace(recording, name=f"{recording.name}, stage {stage}")
+
+
+def _stage_of(recording: Recording, of: str, stage: str | None = None) -> Recording:
+    """The times that were recorded for a stage alone, as those of a recording."""
+    times = recording.stages.get(of)
+    if times is None:
+        raise LaeError(
+            f"sequence {recording.name!r}: the trace has no times of it, stage_{of}_ns: give it a "
+            'time, such as time = "6ms"'
+        )
+    return replace(recording, elapsed_ns=times)
