@@ -4,6 +4,7 @@ from .api.study import run_study
 from .datasets.layouts import find_dataset
 from .datasets.synthetic import synthetic_dataset
 from .decoding import max_decoded
+from .engine.pipeline import Camera, Pipeline, Stage
 from .engine.scheduler import simulate
 from .errors import LaeError, TraceError
 from .evaluation.evaluate import evaluate_runs
@@ -17,6 +18,7 @@ from .learning.registry import load_forecaster
 from .profile.run import profile_tracker
 from .recipes.catalogue import list_recipes
 from .recipes.make import get_trace
+from .replay.pipeline import read_pipeline
 from .replay.run import Run, Runs, replay_sequence
 from .replay.world import SIGMA_GRID, World, replay_trace
 from .report.page import write_report
@@ -32,6 +34,7 @@ __version__: str
 __all__ = [
     "CONVENTIONS",
     "SIGMA_GRID",
+    "Camera",
     "ComparisonResult",
     "EvaluationResult",
     "Forecaster",
@@ -39,10 +42,12 @@ __all__ = [
     "Kalman",
     "LaeError",
     "Metadata",
+    "Pipeline",
     "Recording",
     "Run",
     "Runs",
     "Scene",
+    "Stage",
     "Study",
     "StudyResults",
     "Trace",
@@ -59,6 +64,7 @@ __all__ = [
     "load_forecaster",
     "max_decoded",
     "profile_tracker",
+    "read_pipeline",
     "read_study",
     "read_trace",
     "replay_sequence",

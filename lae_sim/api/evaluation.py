@@ -17,6 +17,7 @@ from lae_sim._compiled import amount, expect
 from lae_sim.api.inputs import (
     Costs,
     Forecasters,
+    Pipelines,
     Traces,
     camera_of,
     check_frames,
@@ -169,7 +170,7 @@ class Evaluated:
             "times_note": runs.times.metadata.timing_note,
             "fps": str(runs.clock.fps),
             "arrivals": runs.arrivals,
-            "policy": label_of(world.policy),
+            "policy": world.policy_label,
             "latency": label_of(world.latency),
             "latency_scale": str(world.scale),
             "convention": world.convention,
@@ -473,7 +474,7 @@ def _setting(scenario: Scenario) -> dict[str, Any]:
         metadata.tracker,
         metadata.dataset,
         scenario.label if timing is None else Path(path_of(timing) or timing.metadata.device).name,
-        label_of(world.policy),
+        world.policy_label,
         float(scenario.runs.clock.fps),
         label_of(world.latency),
         float(world.scale),
@@ -668,6 +669,7 @@ def evaluate(
     camera_lag: int | None = None,
     progress: ShowProgress = None,
     forget_arrivals: bool = False,
+    pipeline: Pipelines = None,
 ) -> EvaluationResult:
     """Replay traces and score them, latency counted.
 
@@ -702,6 +704,7 @@ def evaluate(
             function, which is told: ``progress(done, total, what)``.
         forget_arrivals: let frames arrive evenly also where a trace says when each of them did,
             which is needed for another rate.
+        pipeline: stages around the tracker, or the path of a TOML file of them; or several.
 
     Raises:
         LaeError: if an argument is impossible, a file is missing, or a frame is asked for that a
@@ -728,6 +731,7 @@ def evaluate(
         pre_forecaster=pre_forecaster,
         keep_size=keep_size,
         forget_arrivals=forget_arrivals,
+        pipeline=pipeline,
         sigma=sigma,
         convention=convention,
         forecasters=makers,

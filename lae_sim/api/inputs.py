@@ -21,6 +21,7 @@ from lae_sim.trace.file import Trace
 from lae_sim.trace.locate import find_traces
 
 if TYPE_CHECKING:
+    from lae_sim.engine.pipeline import Pipeline
     from lae_sim.forecast.base import AnyFactory
     from lae_sim.forecast.camera import Camera
     from lae_sim.learning.folds import Trainer
@@ -33,6 +34,11 @@ Forecasters: TypeAlias = (
     "Mapping[str, str | AnyFactory | Trainer]"
 )
 """Forecasters by name, as classes or factories, or as a mapping from names to these."""
+
+Pipelines: TypeAlias = (
+    "Pipeline | str | os.PathLike[str] | Sequence[Pipeline | str | os.PathLike[str]] | None"
+)
+"""A pipeline, or the path of its file, or several."""
 
 Costs: TypeAlias = "str | Iterable[str] | Mapping[str, str]"
 """What forecasting costs: ``"2ms"``, ``"kalman=2ms"``, or ``{"kalman": "2ms"}``."""

@@ -435,6 +435,7 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
         search=getattr(arguments, "search", "off"),
         pre_forecaster=getattr(arguments, "pre_forecaster", None),
         keep_size=getattr(arguments, "keep_size", False),
+        pipeline=getattr(arguments, "pipeline", None) or None,
         forget_arrivals=arguments.forget_arrivals,
         **scores,
     )

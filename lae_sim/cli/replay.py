@@ -45,6 +45,7 @@ examples:
   lae-sim replay trace.parquet --fps 15 30 60 --latency-scale 1/2 1 2 --plot sweep.png
   lae-sim replay trace.parquet --latency constant:47ms,init=800ms --strided trace.gaps.parquet
   lae-sim replay trace.parquet --latency constant:47ms --search c=0.7 --pre-forecaster kalman
+  lae-sim replay trace.parquet --pipeline drone.toml          from the camera to the command
   lae-sim replay a.parquet b.parquet --latency-scale 2 --json | jq '.traces[].results[].auc'
   lae-sim replay a.parquet b.parquet --sigma-grid --out paper       figures and tables in a folder
   lae-sim replay trace.parquet --forecaster my_package.my_module:MyForecaster --per-sequence
@@ -61,6 +62,7 @@ policies, by which a free tracker takes a frame:
 latencies, each perhaps with ,init=TIME for the initialisation (constant:47ms,init=800ms):
   recorded                each frame's recorded time
   by-call                 the k-th call takes the k-th recorded time
+  stage:NAME[+NAME]       the recorded times of a stage, or of several, alone (stage:inference)
   constant:TIME           the same for all calls
   resample:SEED           each call draws one of the recorded times
   lognormal:SEED          each call draws from the lognormal distribution fitted to them
@@ -86,6 +88,13 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add_world(made, sweeps=True)
+    add(
+        "--pipeline",
+        nargs="+",
+        metavar="FILE",
+        help="replay the stages of a TOML file, from the camera to the command; or of several "
+        "files, one after another",
+    )
     add_search(made)
     scores = made.add_argument_group("forecasting and scores")
     add = scores.add_argument

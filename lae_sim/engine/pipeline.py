@@ -24,7 +24,7 @@ CAMERA = "camera"
 WHEN_FULL = ("drop-oldest", "drop-newest", "block")
 """What a stage may do where a frame comes and its queue is full."""
 
-_NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}\Z")
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}\Z")
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Stage:
     """What frames wait for in a queue, and one or several workers do with them.
 
     Attributes:
-        name: of small letters, digits, ``_`` and ``-``.
+        name: of small letters, digits and ``_``.
         time: where its times come from: a duration such as ``"6ms"``, the name of a latency such as
             ``"lognormal:1"``, or a function of the recording. By default the tracker has the
             world's latency, and another stage the times that the trace has recorded for it.
@@ -84,8 +84,6 @@ class Stage:
         after: the stage that its frames come from, or ``"camera"``; by default the one before it in
             the pipeline.
         every: it takes every n-th frame only, by the frames' numbers.
-        of: the stage of the trace whose recorded times ``time`` draws on; by default that of its
-            own name, and of the tracker the whole call.
 
     Raises:
         LaeError: if a value is impossible; it names the stage and the key.
@@ -100,13 +98,12 @@ class Stage:
     priority: int = 0
     after: str | None = None
     every: int = 1
-    of: str | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not _NAME.match(self.name) or self.name == CAMERA:
             raise LaeError(
-                f"name: {shown(self.name)} is no name of a stage: small letters, digits, _ and -, "
-                "a letter first; not 'camera'"
+                f"name: {shown(self.name)} is no name of a stage: small letters, digits and _, a "
+                "letter first; not 'camera'"
             )
         where = f"stage {self.name!r}"
         for key, least in (("workers", 1), ("every", 1), ("queue", 1), ("priority", None)):

@@ -155,7 +155,7 @@ def simulate_pipeline(
         for _ in range(each.stage.workers):
             environment.process(each.worker())
     first = [work[stage.name] for stage in pipeline.after(CAMERA)]
-    delivered = [-1] * length
+    delivered: list[float] = [-1] * length
     environment.process(
         _camera(environment, pipeline.camera.delay_ns, clock, jitter, lost, delivered, first)
     )
@@ -202,7 +202,7 @@ def _camera(
     clock: Clock,
     jitter: Service | None,
     lost: Collection[int],
-    delivered: list[int],
+    delivered: list[float],
     first: list[_Work],
 ) -> Process:
     """Delivers frames in their order."""
@@ -249,8 +249,11 @@ class _Work:
         self.idle: deque[simpy.Event] = deque()
         self.has_turn = False
         self.last = -1  # frame that was taken
-        self.arrived, self.taken, self.started = ([-1] * length for _ in range(3))
-        self.finished, self.left, self.dropped = [-1] * length, [-1] * length, [0] * length
+        # ticks, whole numbers all of them: SimPy's clock is typed to allow more
+        self.arrived: list[float] = [-1] * length
+        self.taken, self.started = self.arrived.copy(), self.arrived.copy()
+        self.finished, self.left = self.arrived.copy(), self.arrived.copy()
+        self.dropped = [0] * length
 
     def offer(self, frame: int) -> simpy.Event | None:
         """Let a frame in, or drop one; what to wait for where neither may be done."""
@@ -365,17 +368,20 @@ class _Work:
     def log(self) -> StageLog:
         """What happened."""
         try:
-            columns = [
-                np.array(each, np.int64)
-                for each in (self.arrived, self.taken, self.started, self.finished, self.left)
-            ]
+            return StageLog(
+                np.array(self.arrived, np.int64),
+                np.array(self.taken, np.int64),
+                np.array(self.started, np.int64),
+                np.array(self.finished, np.int64),
+                np.array(self.left, np.int64),
+                np.array(self.dropped, np.int64),
+            )
         except OverflowError as error:
             late = max(range(len(self.finished)), key=self.finished.__getitem__)
             raise LaeError(
                 f"stage {self.stage.name!r}, frame {late}: done at tick {self.finished[late]}, "
                 "beyond 64 bits: check its times, or write the frame rate more simply"
             ) from error
-        return StageLog(*columns, np.array(self.dropped, np.int64))
 
 
 def _time(what: str, service: Callable[[int], int], frame: int) -> int:

@@ -11,6 +11,7 @@ from .latency import (
     scaled,
 )
 from .names import parse_latency, parse_policy
+from .pipeline import parse_pipeline, parse_time, read_pipeline
 from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
 from .run import Run, Runs, replay_repeated, replay_sequence
 from .search import Outcomes, SearchModel, find_search
@@ -47,9 +48,12 @@ __all__ = [
     "lognormal",
     "own_jumps",
     "parse_latency",
+    "parse_pipeline",
     "parse_policy",
     "parse_sigmas",
+    "parse_time",
     "phases",
+    "read_pipeline",
     "replay_repeated",
     "replay_sequence",
     "replay_trace",

@@ -18,7 +18,7 @@ from lae_sim.replay.latency import Initialised, LatencySource, initialised, time
 from lae_sim.trace.file import Trace
 
 POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime")
-LATENCIES = ("recorded", "by-call", "constant", "resample", "lognormal", "bootstrap")
+LATENCIES = ("recorded", "by-call", "stage", "constant", "resample", "lognormal", "bootstrap")
 """The names of those that come with the package, before their values."""
 
 Value = TypeVar("Value")
@@ -84,6 +84,8 @@ def parse_latency(text: str) -> LatencySource:
         return sources.by_frame
     if text == "by-call":
         return sources.by_call
+    if name == "stage":
+        return named(f"latency {shown(text)}", _stages, value)
     if name == "constant":
         return sources.constant(value)
     if name == "resample":
@@ -101,10 +103,14 @@ def parse_latency(text: str) -> LatencySource:
         unit = "" if text[-1:].isalpha() else "ms"
         meant = f"; did you mean constant:{text:.40}{unit}?"
     raise LaeError(
-        f"no latency {shown(text)}: there are recorded, by-call, constant:47ms, resample:SEED, "
-        f"lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object, all of them perhaps with "
-        f",init=TIME{meant}"
+        f"no latency {shown(text)}: there are recorded, by-call, stage:NAME[+NAME], "
+        "constant:47ms, resample:SEED, lognormal:SEED, bootstrap:SEED[:BLOCK], "
+        f"package.module:object, all of them perhaps with ,init=TIME{meant}"
     )
+
+
+def _stages(value: str) -> sources.StageTimes:
+    return sources.StageTimes(tuple(value.split("+")))
 
 
 def label_of(plugin: object) -> str:

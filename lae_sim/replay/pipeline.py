@@ -39,13 +39,14 @@ from lae_sim.engine.clock import Clock, exact, parse_duration, whole
 from lae_sim.engine.pipeline import CAMERA, Camera, Pipeline, Stage, TimeSource
 from lae_sim.engine.scheduler import Service
 from lae_sim.engine.stages import PipelineSchedule, simulate_pipeline
-from lae_sim.errors import LaeError, hint, listed, shown
+from lae_sim.errors import LaeError, explained, hint, listed, shown
 from lae_sim.plugins import looking_in
 from lae_sim.replay.latency import (
     Constant,
     Initialised,
     LatencySource,
     RandomSource,
+    StageTimes,
     Uniform,
     by_call,
     by_frame,
@@ -203,16 +204,18 @@ class PipelineTimes:
         sources: by stage; that of the tracker only if it is not the world's latency.
         jitter: of the camera; None for none.
         lost: the frames of a recording that the camera loses.
+        scale: exact factor on the times of the stages in ``sources``; not on the jitter.
     """
 
     pipeline: Pipeline
     sources: Mapping[str, LatencySource] = field(hash=False)
     jitter: LatencySource | None
     lost: Callable[[Recording], frozenset[int]]
+    scale: Fraction = Fraction(1)
 
     @classmethod
     def of(cls, pipeline: Pipeline, scale: Fraction = Fraction(1)) -> PipelineTimes:
-        """Those of a pipeline, all stages' times scaled by an exact factor; not the camera's.
+        """Those of a pipeline.
 
         Raises:
             LaeError: if there is no source of a name; it names the stage and the key.
@@ -221,18 +224,17 @@ class PipelineTimes:
         for stage in pipeline.stages:
             if stage.time is None and stage.name == pipeline.tracker:
                 continue
-            source = by_frame if stage.time is None else _source(
-                f"stage {stage.name!r}: time", stage.time
-            )
-            found[stage.name] = scaled(source, scale)
-        camera = pipeline.camera
-        jitter = None if camera.jitter is None else _source("camera: jitter", camera.jitter)
-        return cls(pipeline, found, jitter, named("camera", parse_drops, camera.drops))
-
-    def of_tracker(self, recording: Recording) -> Recording:
-        """What the tracker's times are drawn from."""
-        tracker = next(s for s in self.pipeline.stages if s.name == self.pipeline.tracker)
-        return recording if tracker.of is None else _stage_of(recording, tracker.of)
+            time = f"stage:{stage.name}" if stage.time is None else stage.time
+            found[stage.name] = _source(f"stage {stage.name!r}: time", time)
+        camera, jitter = pipeline.camera, None
+        if camera.jitter is not None:
+            jitter = _source("camera: jitter", camera.jitter)
+            if _draws_on_recorded(jitter):
+                raise LaeError(
+                    f"camera: jitter: {camera.jitter!r} are a tracker's times: write a duration, "
+                    "or uniform:LOW-HIGH:SEED, such as uniform:0ms-8ms:1"
+                )
+        return cls(pipeline, found, jitter, named("camera", parse_drops, camera.drops), scale)
 
     def schedule(
         self, recording: Recording, clock: Clock, tracker: Service, repetition: int = 0
@@ -251,17 +253,10 @@ class PipelineTimes:
         services: dict[str, Service] = {self.pipeline.tracker: tracker}
         for stage in self.pipeline.stages:
             if stage.name != self.pipeline.tracker:
-                source = _repeated(self.sources[stage.name], repetition)
-                times = _named_after(stage.name, recording)
-                if _draws_on_recorded(source):
-                    times = _stage_of(times, stage.of or stage.name, stage.name)
-                services[stage.name] = source(times)
+                services[stage.name] = self._service(stage.name, recording, repetition)
         jitter = None
         if self.jitter is not None:
-            times = _named_after(CAMERA, recording)
-            if _draws_on_recorded(self.jitter):
-                times = _stage_of(times, CAMERA, CAMERA)
-            jitter = _repeated(self.jitter, repetition)(times)
+            jitter = _repeated(self.jitter, repetition)(_named_after(CAMERA, recording))
         try:
             return simulate_pipeline(
                 self.pipeline, len(recording), clock, services, jitter, self.lost(recording)
@@ -270,6 +265,14 @@ class PipelineTimes:
             if str(error).startswith("sequence "):
                 raise
             raise LaeError(f"sequence {recording.name!r}: {error}") from error
+
+    def _service(self, stage: str, recording: Recording, repetition: int) -> Service:
+        source = _repeated(self.sources[stage], repetition)
+        own = _named_after(stage, recording)
+        with explained(f"stage {stage!r}: time"):
+            if _draws_on_recorded(source):
+                own = replace(own, elapsed_ns=StageTimes((stage,))(own).ns)
+            return scaled(source, self.scale)(own)
 
 
 def _source(what: str, source: TimeSource) -> LatencySource:
@@ -296,14 +299,3 @@ def _draws_on_recorded(source: LatencySource) -> bool:
 def _named_after(stage: str, recording: Recording) -> Recording:
     """A recording under a name of the stage's own, for messages, and for streams of its own."""
     return replace(recording, name=f"{recording.name}, stage {stage}")
-
-
-def _stage_of(recording: Recording, of: str, stage: str | None = None) -> Recording:
-    """The times that were recorded for a stage alone, as those of a recording."""
-    times = recording.stages.get(of)
-    if times is None:
-        raise LaeError(
-            f"sequence {recording.name!r}: the trace has no times of it, stage_{of}_ns: give it a "
-            'time, such as time = "6ms"'
-        )
-    return replace(recording, elapsed_ns=times)

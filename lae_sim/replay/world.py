@@ -12,7 +12,9 @@ from fractions import Fraction
 from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
+from lae_sim.engine import policies
 from lae_sim.engine.clock import Clock, Number, exact, parse_fps
+from lae_sim.engine.pipeline import Pipeline
 from lae_sim.engine.scheduler import Policy, scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.files import sequence_names
@@ -39,6 +41,7 @@ from lae_sim.replay.names import (
     text,
 )
 from lae_sim.replay.passes import split_passes
+from lae_sim.replay.pipeline import PipelineTimes, parse_time, read_pipeline
 from lae_sim.replay.run import Runs
 from lae_sim.replay.search import find_search, parse_search
 from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
@@ -61,6 +64,7 @@ TraceLike: TypeAlias = "str | os.PathLike[str] | Trace"
 
 Value = TypeVar("Value")
 
+_TRACES_OWN = (RandomSource, sources.StageTimes)  # sources whose initialisations are the trace's
 _TRACE = (str, os.PathLike, Trace)
 _A_TRACE = "a path, a URL or what read_trace gives"
 
@@ -93,6 +97,8 @@ class World:
         convention: how frames and thresholds count, by name.
         forecasters: names.
         costs: what forecasting costs, such as ``"2ms"`` or ``"kalman=2ms"``.
+        pipeline: stages around the tracker, whose queues say which frames it takes, rather than a
+            policy; the latency is the tracker's, unless that stage has times of its own.
 
     Raises:
         LaeError: if a value is impossible, or some do not go together.
@@ -121,6 +127,7 @@ class World:
     forecasters: tuple[str, ...] = ("hold",)
     costs: tuple[str, ...] = ()
     forget_arrivals: bool = False
+    pipeline: Pipeline | None = None
 
     def __post_init__(self) -> None:
         for name in ("passes", "sigmas", "forecasters", "costs"):
@@ -157,6 +164,8 @@ class World:
         numbers: tuple[object, ...] = (self.scale, *self.sigmas)
         if not all(isinstance(n, (Fraction, int)) and not isinstance(n, bool) for n in numbers):
             raise LaeError("scale and sigmas of a World are exact; World.of takes text too")
+        if self.pipeline is not None:
+            object.__setattr__(self, "latency", self._tracker_latency(self.pipeline))
         scaled(self.source(), self.scale)
         check_sigmas(self.sigmas)
         if not scores_latency(self.rule()):
@@ -165,6 +174,29 @@ class World:
                     raise LaeError(
                         f"{label_of(self.policy)} never scores latency: it goes with no {what}"
                     )
+
+    def _tracker_latency(self, pipeline: Pipeline) -> str | LatencySource | Plugin:
+        """The world's latency, which is that of the pipeline's tracker if this has one."""
+        if not isinstance(pipeline, Pipeline):
+            raise LaeError(f"pipeline: such as read_pipeline('drone.toml'), not {shown(pipeline)}")
+        if self.rule() is not policies.latest:
+            raise LaeError(
+                f"policy: {label_of(self.policy)} does not go with a pipeline, whose queues say "
+                "which frames are taken"
+            )
+        PipelineTimes.of(pipeline)
+        time = next(each.time for each in pipeline.stages if each.name == pipeline.tracker)
+        if time is None:
+            return self.latency
+        own: str | LatencySource = time
+        if isinstance(time, str) and hasattr(source := parse_time(time), "label"):
+            own = source
+        if self.latency not in ("recorded", own):
+            raise LaeError(
+                f"latency: {label_of(self.latency)}, and the pipeline says {label_of(own)}: leave "
+                f"out the time of its stage {pipeline.tracker!r}"
+            )
+        return own
 
     @classmethod
     def of(
@@ -184,6 +216,7 @@ class World:
         forecasters: str | Iterable[str] = ("hold",),
         costs: str | Iterable[str] = (),
         forget_arrivals: bool = False,
+        pipeline: Pipeline | str | os.PathLike[str] | None = None,
     ) -> World:
         """A world from text and plain numbers, as command lines and files have them.
 
@@ -208,6 +241,7 @@ class World:
             forecasters=tuple(dict.fromkeys(several(forecasters))),
             costs=several(costs),
             forget_arrivals=forget_arrivals,
+            pipeline=_pipeline(pipeline),
         )
 
     @classmethod
@@ -215,12 +249,13 @@ class World:
         cls,
         *,
         policy: Any = "latest",
+        pipeline: Any = None,
         fps: Any = None,
         latency: Any = "recorded",
         scale: Any = 1,
         **others: Any,
     ) -> tuple[World, ...]:
-        """The worlds of every combination of some policies, rates, latencies and scales.
+        """The worlds of all combinations of some policies, pipelines, rates, latencies and scales.
 
         Each is one value or several; the last varies fastest. ``others`` are as in :meth:`of`. A
         plug-in that is named is made once, and shared by the worlds.
@@ -234,6 +269,7 @@ class World:
         factors = [named("scale", _factor, each) for each in several(scale)]
         swept: dict[str, list[Any]] = {
             "policy": _distinct("policy", rules),
+            "pipeline": [None] if pipeline is None else _pipelines(several(pipeline)),
             "fps": [None] if fps is None else list(dict.fromkeys(rates)),
             "latency": _distinct("latency", times),
             "scale": list(dict.fromkeys(factors)),
@@ -259,6 +295,11 @@ class World:
             return self.latency.made  # type: ignore[no-any-return]
         return parse_latency(self.latency) if isinstance(self.latency, str) else self.latency
 
+    @property
+    def policy_label(self) -> str:
+        """What says which frames are taken: the policy, or ``"pipeline:NAME"``."""
+        return label_of(self.policy) if self.pipeline is None else f"pipeline:{self.pipeline.name}"
+
     def label(self) -> str:
         """The latency and its scale, such as ``"recorded x 2"``."""
         name = label_of(self.latency)
@@ -280,7 +321,7 @@ class World:
             found = f"{ASSUMED}{source.init_ns / 1e6:g} ms"
         elif isinstance(source, Constant):
             found = AS_A_FRAME
-        elif isinstance(source, RandomSource) or source in (sources.by_frame, sources.by_call):
+        elif isinstance(source, _TRACES_OWN) or source in (sources.by_frame, sources.by_call):
             found = times.init_source
         else:
             found = f"given by {label_of(self.latency)}"
@@ -321,6 +362,7 @@ class World:
             (*(each if names is None else each.chosen(names) for each in strided), *gaps),
             find_search(self.search, opened.metadata, gaps, pre_forecaster, self.keep_size),
             self.forget_arrivals,
+            None if self.pipeline is None else PipelineTimes.of(self.pipeline, self.scale),
         )
 
 
@@ -335,12 +377,14 @@ def replay_trace(
     passes: TraceLike | Iterable[TraceLike] = (),
     search: str = "trace",
     forget_arrivals: bool = False,
+    pipeline: Pipeline | str | os.PathLike[str] | None = None,
 ) -> Runs:
     """Replay every sequence of a trace, one after another.
 
     Args:
         trace: the boxes and the truth: an open trace, or the path or URL of one.
-        fps, policy, latency, scale, timing, passes, search, forget_arrivals: see :meth:`World.of`.
+        fps, policy, latency, scale, timing, passes, search, forget_arrivals, pipeline: see
+            :meth:`World.of`; a pipeline may be the path of its file.
 
     Returns:
         The runs, which are made while one goes through them, and may be gone through again.
@@ -363,6 +407,7 @@ def replay_trace(
         scale=scale,
         search=search,
         forget_arrivals=forget_arrivals,
+        pipeline=pipeline,
         **open_others(timing, passes),
     )
     return world.replay(opened)
@@ -424,6 +469,24 @@ def _made(name: str, given: Any, parse: Callable[[str], object], known: Iterable
         return given
     made = named(name, parse, given)
     return given if kind_of(given) in known else Plugin(given, made)
+
+
+def _pipeline(given: Any) -> Pipeline | None:
+    """A pipeline, read if it is the path of a file."""
+    if isinstance(given, (str, os.PathLike)):
+        return named("pipeline", read_pipeline, given)
+    made: Pipeline | None = given
+    return made
+
+
+def _pipelines(given: Iterable[Any]) -> list[Pipeline | None]:
+    """Pipelines, each once, no two of the same name."""
+    found: dict[str, Pipeline | None] = {}
+    for each in map(_pipeline, given):
+        name = getattr(each, "name", "")
+        if found.setdefault(name, each) != each:
+            raise LaeError(f"pipeline: two are called {name!r}: give them names of their own")
+    return list(found.values())
 
 
 def _distinct(name: str, plugins: Iterable[Any]) -> list[Any]:
