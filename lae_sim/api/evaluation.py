@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from lae_sim._arrays import Floats
+    from lae_sim.evaluation.pipeline import PipelineTotals
     from lae_sim.figures.column import ColumnFigure
     from lae_sim.figures.lines import Panel
 
@@ -102,6 +103,12 @@ class Scenario:
         stalls = SkippedStalls()
         if self.world.times_kind == "recorded" and self.world.timing is None:
             observers = [*observers, stalls]
+        pipeline = None
+        if self.world.pipeline is not None:
+            from lae_sim.evaluation.pipeline import PipelineTotals
+
+            pipeline = PipelineTotals(self.world.pipeline, self.world.sigmas)
+            observers = [*observers, pipeline]
 
         def runs() -> Iterator[Run]:
             for run in self.runs:
@@ -128,7 +135,7 @@ class Scenario:
                 rows.add(part)
         notes = notes_on(totals.replay, metadata, convention, self.forecasters)
         notes += [*self.runs.notes(), *stalls.notes(), *cost_notes(self.costs)]
-        return Evaluated(self, totals, rows, tuple(notes))
+        return Evaluated(self, totals, rows, tuple(notes), pipeline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,12 +147,14 @@ class Evaluated:
         totals: its scores over all sequences, and over those of each attribute.
         rows: the scores of each sequence, if they were kept.
         notes: what keeps the scores from being what they seem, a sentence each.
+        pipeline: what happened at its stages; None where there is none.
     """
 
     scenario: Scenario
     totals: Totals
     rows: SequenceRows
     notes: tuple[str, ...]
+    pipeline: PipelineTotals | None = None
 
     @property
     def init(self) -> InitCost:
@@ -158,7 +167,7 @@ class Evaluated:
         scenario, world = self.scenario, self.scenario.world
         metadata, runs = scenario.trace.metadata, scenario.runs
         path = path_of(scenario.trace) or scenario.label
-        return {
+        document = {
             "trace": path,
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
@@ -187,6 +196,13 @@ class Evaluated:
                 attributes,
             ),
         }
+        if self.pipeline is not None:
+            document["pipeline"] = self.pipeline.report()
+            delays = {float(s): self.pipeline.answer_delay_ms(s) for s in world.sigmas}
+            for result in document["results"]:  # LAE's age knows no camera
+                result["capture_age_ms"] = result["age_ms"]
+                result["age_ms"] -= delays[result["sigma"]]
+        return document
 
 
 def scenarios(

@@ -381,7 +381,7 @@ def check_outputs(
             yield from [value] if isinstance(value, str) else value or ()
 
     written = [path for path in outputs if path]
-    read = [*traces, *given("trace", "closed_loop", "strided", "timing", "root")]
+    read = [*traces, *given("trace", "closed_loop", "strided", "timing", "root", "pipeline")]
     for name in given("forecaster", "pre_forecaster", "latency", "policy"):
         read += files_named(name)
     check_distinct(written, read)

@@ -91,6 +91,7 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--pipeline",
         nargs="+",
+        default=[],
         metavar="FILE",
         help="replay the stages of a TOML file, from the camera to the command; or of several "
         "files, one after another",
@@ -169,6 +170,7 @@ def _replay(arguments: argparse.Namespace) -> None:
         setattr(arguments, name, list(dict.fromkeys(getattr(arguments, name))))
     arguments.traces = find_traces(arguments.traces)
     swept = [name for name in ("fps", "latency_scale") if len(getattr(arguments, name)) > 1]
+    swept += ["policy"] if len(arguments.pipeline) > 1 else []
     _check_files(arguments, swept)
     worlds = worlds_of(
         arguments,
@@ -231,7 +233,9 @@ def _check_files(arguments: argparse.Namespace, swept: Sequence[str]) -> None:
         raise LaeError(f"--{asked[0]} takes one trace at a time")
     asked += ["export-txt"] if arguments.export_txt else []
     if asked and swept:
-        raise LaeError(f"--{asked[0]} takes one frame rate and one scale of the times at a time")
+        raise LaeError(
+            f"--{asked[0]} takes one frame rate, scale of the times and pipeline at a time"
+        )
     if arguments.strided and len(arguments.traces) > 1:
         raise LaeError("--strided goes with one trace at a time")
     outputs = [*(getattr(arguments, name) for name in _FILES), arguments.plot, arguments.out]
@@ -284,6 +288,7 @@ def _print_tables(
     from lae_sim.report.replay import (
         attribute_table,
         closing_text,
+        pipeline_text,
         sequence_table,
         settings_text,
         summary_table,
@@ -298,5 +303,7 @@ def _print_tables(
     print_text(summary_table(reports, trace_labels, shown, swept, width), end="\n\n")
     for each in reports:
         print_text(settings_text(each))
+        if "pipeline" in each:
+            print_text(f"\n{pipeline_text(each, width)}\n")
     if closing := closing_text(reports, trace_labels, swept):
         print_text(closing)

@@ -142,13 +142,13 @@ class Pipeline:
 
     Example:
         >>> import lae_sim
-        >>> drone = lae_sim.Pipeline(
-        ...     [lae_sim.Stage("decode", "6ms"), lae_sim.Stage("tracker"), lae_sim.Stage("publish", "2ms")],
-        ...     camera=lae_sim.Camera(exposure="4ms", delivery="8ms"),
-        ... )
-        >>> [stage.name for stage in drone.stages], drone.output
-        (['decode', 'tracker', 'publish'], 'publish')
-    """  # noqa: E501
+        >>> stages = [lae_sim.Stage("decode", "6ms"), lae_sim.Stage("tracker", queue=2)]
+        >>> drone = lae_sim.Pipeline(stages, camera=lae_sim.Camera(delivery="8ms"), name="drone")
+        >>> drone
+        <Pipeline 'drone': camera > decode > tracker>
+        >>> lae_sim.evaluate("traces/synthetic-slow.parquet", pipeline=drone, scale=1.5)
+        <EvaluationResult of synthetic-slow.parquet, recorded x 3/2: AUC hold ...>
+    """
 
     stages: Sequence[Stage]
     camera: Camera = field(default_factory=Camera)

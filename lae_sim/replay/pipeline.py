@@ -30,7 +30,7 @@ from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,7 +38,6 @@ from lae_sim.decoding import read_toml
 from lae_sim.engine.clock import Clock, exact, parse_duration, whole
 from lae_sim.engine.pipeline import CAMERA, Camera, Pipeline, Stage, TimeSource
 from lae_sim.engine.scheduler import Service
-from lae_sim.engine.stages import PipelineSchedule, simulate_pipeline
 from lae_sim.errors import LaeError, explained, hint, listed, shown
 from lae_sim.plugins import looking_in
 from lae_sim.replay.latency import (
@@ -53,8 +52,11 @@ from lae_sim.replay.latency import (
     scaled,
     stream,
 )
-from lae_sim.replay.names import named, parse_latency, text
+from lae_sim.replay.names import LATENCIES, named, parse_latency, text
 from lae_sim.trace.recording import Recording
+
+if TYPE_CHECKING:
+    from lae_sim.engine.stages import PipelineSchedule
 
 _RANGE = re.compile(r"([0-9.]+[a-z]+)-([0-9.]+[a-z]+):([0-9]+)\Z")
 _SHARE = re.compile(r"([0-9./]+):([0-9]+)\Z")
@@ -158,7 +160,12 @@ def parse_time(name: str) -> LatencySource:
         return Uniform(parse_duration(found[1]), parse_duration(found[2]), int(found[3]))
     if name[:1].isdigit() and name[-1:] == "s":
         return Constant(parse_duration(name))
-    return parse_latency(name)
+    try:
+        return parse_latency(name)
+    except LaeError as error:
+        if kind in LATENCIES or ":" in name:
+            raise
+        raise LaeError(f"{error}; or a duration, 6ms, or uniform:LOW-HIGH:SEED") from error
 
 
 def parse_drops(drops: Any) -> Callable[[Recording], frozenset[int]]:
@@ -250,6 +257,8 @@ class PipelineTimes:
         Raises:
             LaeError: if the recording lacks a stage's times, or one is impossible.
         """
+        from lae_sim.engine.stages import simulate_pipeline  # with SimPy, which few replays need
+
         services: dict[str, Service] = {self.pipeline.tracker: tracker}
         for stage in self.pipeline.stages:
             if stage.name != self.pipeline.tracker:
