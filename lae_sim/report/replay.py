@@ -421,7 +421,7 @@ def pipeline_text(report: Report, width: int | None = None) -> str:
         f"{pipeline['name']}: the camera lost {camera['lost']:,} of {camera['frames']:,} frames "
         f"and delivered the others after {_MS(camera['delay_ms'])}",
         "",
-        text_of_records(_PIPELINE, pipeline["stages"], width),
+        text_of_records(_pipeline_columns(pipeline["stages"]), pipeline["stages"], width),
         "",
     ]
     lines += [
@@ -433,7 +433,15 @@ def pipeline_text(report: Report, width: int | None = None) -> str:
         f"at sigma {result['sigma']:g} an answer is {_MS(result['age_ms'])} old, from its frame's "
         f"delivery on, and {_MS(result['capture_age_ms'])} from its capture on"
     )
+    lines[-1:] = [fill(lines[-1], 100, break_on_hyphens=False)]
     return "\n".join(lines)
+
+
+def _pipeline_columns(stages: Sequence[Report]) -> list[Column]:
+    """Those of which there is something to say."""
+    rare = ("resource_wait_ms", "blocked_ms")
+    said = [key for key in rare if any(stage[key] for stage in stages)]
+    return [column for column in _PIPELINE if column.value not in rare or column.value in said]
 
 
 def _drops(stage: Report) -> str:
