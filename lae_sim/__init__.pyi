@@ -18,7 +18,6 @@ from .learning.registry import load_forecaster
 from .profile.run import profile_tracker
 from .recipes.catalogue import list_recipes
 from .recipes.make import get_trace
-from .replay.pipeline import read_pipeline
 from .replay.run import Run, Runs, replay_sequence
 from .replay.world import SIGMA_GRID, World, replay_trace
 from .report.page import write_report
@@ -64,7 +63,6 @@ __all__ = [
     "load_forecaster",
     "max_decoded",
     "profile_tracker",
-    "read_pipeline",
     "read_study",
     "read_trace",
     "replay_sequence",

@@ -65,13 +65,16 @@ _SHARE = re.compile(r"([0-9./]+):([0-9]+)\Z")
 def read_pipeline(path: str | os.PathLike[str]) -> Pipeline:
     """Read a pipeline from a TOML file; modules of yours are found in its folder.
 
+    Args:
+        path: of the file.
+
     Raises:
         LaeError: if it cannot be read, is not TOML, or is no valid pipeline; it names the file, the
             stage and the key.
 
     Example:
-        >>> import lae_sim
-        >>> lae_sim.read_pipeline("traces/pipeline.toml")
+        >>> from lae_sim.replay import read_pipeline
+        >>> read_pipeline("traces/pipeline.toml")
         <Pipeline 'pipeline': camera > decode > tracker > publish>
     """
     if not isinstance(path, (str, os.PathLike)):

@@ -178,7 +178,7 @@ class World:
     def _tracker_latency(self, pipeline: Pipeline) -> str | LatencySource | Plugin:
         """The world's latency, which is that of the pipeline's tracker if this has one."""
         if not isinstance(pipeline, Pipeline):
-            raise LaeError(f"pipeline: such as read_pipeline('drone.toml'), not {shown(pipeline)}")
+            raise LaeError(f"pipeline: a Pipeline, or the path of its file, not {shown(pipeline)}")
         if self.rule() is not policies.latest:
             raise LaeError(
                 f"policy: {label_of(self.policy)} does not go with a pipeline, whose queues say "

@@ -239,7 +239,7 @@ def test_the_world_s_latency_is_the_tracker_s() -> None:
         World.of(pipeline=own, latency="constant:3ms")
     with pytest.raises(LaeError, match="policy: fifo does not go with a pipeline"):
         World.of(pipeline=own, policy="fifo")
-    with pytest.raises(LaeError, match="pipeline: such as read_pipeline"):
+    with pytest.raises(LaeError, match="pipeline: a Pipeline, or the path"):
         World.of(pipeline=3)  # type: ignore[arg-type]
 
 
