@@ -100,7 +100,7 @@ class Setting:
     @property
     def policy(self) -> str:
         """The policy as the study names it."""
-        return label_of(self.world.policy)
+        return self.world.policy_label
 
     @property
     def latency(self) -> str:

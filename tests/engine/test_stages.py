@@ -244,6 +244,32 @@ def test_a_full_queue_lets_the_initialisation_in() -> None:
     assert ms(scale.taken)[:3] == [101, 41, 161]
 
 
+def test_two_trackers_on_one_gpu_take_turns() -> None:
+    stages = [Stage(name, resource="gpu", after="camera") for name in ("tracker", "other")]
+    pipeline = Pipeline(stages, resources={"gpu": 1})
+    schedule = simulate_pipeline(pipeline, 9, CLOCK, constant(tracker=40, other=40))
+    # each waits for the other with a frame in its hands, which is 40 ms old as it begins
+    assert ms(schedule.start) == [0, 80, 160, 240, 320]
+    assert schedule.frames.tolist() == [0, 1, 3, 5, 7]
+    other = schedule.stages["other"]
+    assert ms(other.started[other.started >= 0]) == [40, 120, 200, 280]
+    alone = simulate_pipeline(Pipeline([Stage("tracker")]), 9, CLOCK, constant(tracker=40))
+    assert alone.frames.tolist() == list(range(9))
+
+
+@pytest.mark.parametrize("when_full", ["drop-oldest", "drop-newest"])
+def test_a_queue_of_ten_makes_everything_late(when_full: str) -> None:
+    def age_ms(queue: int) -> float:
+        stage = Stage("tracker", queue=queue, when_full=when_full)
+        schedule = simulate_pipeline(Pipeline([stage]), 2000, CLOCK, constant(tracker=47))
+        ages = schedule.start - CLOCK.arrival(schedule.frames)
+        return float(ages[len(ages) // 2 :].mean()) / CLOCK.ticks_per_ns / MS
+
+    # nine or ten frames wait: nine calls of 47 ms more, or nine frames of 40 ms
+    more = 9 * 40 if when_full == "drop-oldest" else 9 * 47
+    assert age_ms(10) - age_ms(1) == pytest.approx(more, abs=1)
+
+
 @pytest.mark.parametrize(
     ("time", "error", "says"),
     [

@@ -98,3 +98,25 @@ def test_without_a_pipeline_nothing_is_said_of_one() -> None:
     (document,) = evaluate(trace).document()["traces"]
     assert "pipeline" not in document
     assert "capture_age_ms" not in document["results"][0]
+
+
+def scores(result: EvaluationResult) -> list[list[float]]:
+    figures = ["auc", "dp20", "norm_auc", "norm_dp20", "offline_auc"]
+    return result.summary.sort_values(["forecaster", "sigma"])[figures].values.tolist()
+
+
+def test_what_comes_after_the_tracker_delays_answers_as_a_forecaster_s_cost_does() -> None:
+    trace = Trace(Metadata.new("25", "every-frame"), [moving(120), moving(90, 5, "b")])
+    common: dict[str, Any] = {"forecasters": ["hold", "kalman"], "sigma": "grid", "search": "off"}
+    stages = [Stage("tracker"), Stage("forecaster", "3ms"), Stage("publish", "9ms")]
+    piped = evaluate(trace, pipeline=Pipeline(stages), **common)
+    costs = {"hold": "12ms", "kalman": "12ms"}
+    assert scores(piped) == scores(evaluate(trace, costs=costs, **common))
+
+
+def test_a_camera_that_is_late_makes_all_answers_late() -> None:
+    trace = Trace(Metadata.new("25", "every-frame"), [moving(120)])  # 40 ms a frame
+    common: dict[str, Any] = {"forecasters": ["hold", "kalman"], "search": "off"}
+    late = Pipeline([Stage("tracker")], Camera("4ms", "6ms"))
+    piped = evaluate(trace, pipeline=late, sigma=["1/4", "1/2", "1"], **common)
+    assert scores(piped) == scores(evaluate(trace, sigma=[0, "1/4", "3/4"], **common))
