@@ -178,6 +178,7 @@ class ComparisonResult:
         Raises:
             LaeError: if a file cannot be written.
         """
+        from lae_sim.figures.column import drawn
         from lae_sim.report.comparison import paper_tables
         from lae_sim.report.paper import Paper, write_paper
 
@@ -185,7 +186,8 @@ class ComparisonResult:
         attributes = self.attributes if self._names_attributes else None
         tables = paper_tables(self.summary, self.metrics, metadata, attributes)
         frames = {"scores": self.summary, "sequences": self.scores}
-        write_paper(Paper(self._figures(), tables, frames, documents or {}), folder)
+        figures = map(drawn, self._figures())
+        write_paper(Paper(figures, tables, frames, documents or {}), folder)
 
     @property
     def _names_attributes(self) -> bool:

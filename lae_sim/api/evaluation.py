@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -432,12 +432,13 @@ class EvaluationResult:
         Raises:
             LaeError: if a file cannot be written.
         """
+        from lae_sim.figures.column import drawn
         from lae_sim.report.paper import Paper, write_paper
 
         document = self.document(attributes=True)
         write_paper(
             Paper(
-                figures_for_paper(self.parts),
+                map(drawn, figures_for_paper(self.parts)),
                 paper_tables(document["traces"], [part.scenario.label for part in self.parts]),
                 {"scores": self.summary, "sequences": self.to_frame()},
                 {"replay.json": document},
@@ -646,7 +647,7 @@ def figures_for_paper(
             yield ColumnFigure(
                 f"{_metric(panel)}-over-{swept[0]}-{panel.title}",
                 f"{panel.ylabel} over the {panel.xlabel}; {panel.title} {plotted.setting}",
-                panel_in_column(panel),
+                partial(panel_in_column, panel),
             )
     else:
         yield from curves_for_paper(plotted.curves(parts), plotted.setting)
@@ -656,7 +657,7 @@ def figures_for_paper(
                 yield ColumnFigure(
                     f"{_metric(panel)}-over-sigma-{name}",
                     f"{panel.ylabel} over the {panel.xlabel}; {part.scenario.label}",
-                    panel_in_column(panel),
+                    partial(panel_in_column, panel),
                 )
     first = parts[0].scenario
     if scores_latency(first.world.rule()) and not any(first.costs.values()):

@@ -367,8 +367,8 @@ def _run(jobs: Sequence[_Job], schedules: Schedules, repetition: Ints) -> RunBat
         for job, calls in zip(jobs, of_run)
     ]
     tables, which = distinct(used)
-    lengths = [len(each.recording) for each in tables]
-    row = np.repeat((np.cumsum(lengths) - lengths)[which], np.diff(schedules.offsets))
+    lengths = np.array([len(each.recording) for each in tables], np.int64)
+    row: Ints = np.repeat((np.cumsum(lengths) - lengths)[which], np.diff(schedules.offsets))
     row += schedules.frames
     boxes = np.concatenate([each.recording.boxes for each in tables]).take(row, axis=0)
     absent = np.isnan(boxes[:, 0])
