@@ -18,7 +18,7 @@ from lae_sim.figures.study import study_in_columns
 from lae_sim.files import text_digest, written_whole
 from lae_sim.plugins import looking_in
 from lae_sim.progress import ProgressBar, ShowProgress
-from lae_sim.replay.world import named
+from lae_sim.replay.names import named
 from lae_sim.report.page import page_drawings, page_of, page_sections
 from lae_sim.report.paper import Paper, remove_paper, write_paper, written_before
 from lae_sim.report.study_tables import paper_tables

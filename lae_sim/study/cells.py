@@ -28,9 +28,10 @@ from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import RandomSource
+from lae_sim.replay.names import kind_of, label_of
 from lae_sim.replay.run import Repetitions, Run
 from lae_sim.replay.search import SearchModel
-from lae_sim.replay.world import World, kind_of, label_of
+from lae_sim.replay.world import World
 from lae_sim.study.rows import CellRows, RowsFile
 from lae_sim.study.spec import is_random
 from lae_sim.trace.file import Trace, held, read_trace
@@ -99,7 +100,7 @@ class Setting:
     @property
     def policy(self) -> str:
         """The policy as the study names it."""
-        return label_of(self.world.policy)
+        return self.world.policy_label
 
     @property
     def latency(self) -> str:
