@@ -6,8 +6,9 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
-from itertools import islice
-from typing import TypeAlias, TypeVar
+from itertools import groupby, islice
+from operator import itemgetter
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -191,6 +192,17 @@ def _joined(records: Sequence[Record], axis: int = 0) -> Record:
     return type(first)(*(np.concatenate(column, axis) for column in columns))
 
 
+def _pieces(record: Record, span: slice, axis: int = 0) -> Record:
+    """A span of each of a record's arrays."""
+    columns = (getattr(record, field.name) for field in fields(record))
+    return type(record)(*(_piece(column, span, axis) for column in columns))
+
+
+def _piece(values: Any, span: slice, axis: int = 0) -> Any:
+    """A span of an array, in one piece: sums over it are those over an array of its own."""
+    return np.ascontiguousarray(values[(slice(None),) * axis + (span,)])
+
+
 @dataclass(frozen=True, eq=False)
 class Answers:
     """The answer for every world frame of one sequence at one sigma.
@@ -290,10 +302,7 @@ def evaluate_groups(
     Raises:
         LaeError: as :func:`evaluate_runs`.
     """
-    if not forecasters:
-        raise LaeError("name at least one forecaster, such as hold")
     scoring = _Scoring(
-        metadata,
         forecasters,
         sigmas,
         convention,
@@ -305,9 +314,85 @@ def evaluate_groups(
     offline: dict[Recording, _Offline] = {}
     for group in batched(runs, frames, BESIDE):
         offline = _offline([run.recording for run in group], convention, offline)
-        yield scoring.of(group, [offline[run.recording] for run in group])
+        yield from scoring.of([_Part(metadata, group)], offline)
     if not offline:
         raise LaeError("there is nothing to evaluate: no sequences")
+
+
+def evaluate_together(
+    runs: Iterable[tuple[int, Run]],
+    metadata: Sequence[Metadata],
+    forecasters: Mapping[str, AnyFactory],
+    sigmas: Sequence[Fraction],
+    convention: Convention = PYSOT,
+    costs: Mapping[str, int] | None = None,
+    frames: int = GROUP_FRAMES,
+) -> Iterator[tuple[int, Evaluation]]:
+    """The groups of :func:`evaluate_groups` of several replays; small groups are scored at once.
+
+    Args:
+        runs: each with the place of its replay, in the order of the replays.
+        metadata: of the trace of each replay.
+        forecasters, sigmas, convention, costs, frames: see :func:`evaluate_groups`.
+
+    Yields:
+        The place of the replay, and a group of its sequences.
+
+    Raises:
+        LaeError: if there is no forecaster, or whatever iterating over the runs raises.
+    """
+    scoring = _Scoring(forecasters, sigmas, convention, costs or {})
+    parts = (
+        _Part(metadata[place], group, place)
+        for place, own in groupby(runs, itemgetter(0))
+        for group in batched((run for _, run in own), frames, BESIDE)
+    )
+    offline: dict[Recording, _Offline] = {}
+    for _, alike in groupby(parts, _Part.way):
+        for some in _merged(alike, frames):
+            recordings = [run.recording for part in some for run in part.runs]
+            offline = _offline(recordings, convention, offline)
+            yield from zip((part.place for part in some), scoring.of(some, offline))
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Runs of one replay that are scored at once.
+
+    Attributes:
+        metadata: of the trace.
+        runs: some of the replay's.
+        place: the replay's.
+    """
+
+    metadata: Metadata
+    runs: Sequence[Run]
+    place: int = 0
+
+    def __len__(self) -> int:
+        """About how many world frames take as much memory."""
+        return sum(len(run) + BESIDE for run in self.runs)
+
+    def way(self) -> tuple[int, int, bool, bool]:
+        """Parts that differ in it cannot be paired together, or not as they are alone."""
+        schedules = [run.schedule for run in self.runs]
+        clock, scored = schedules[0].clock, schedules[0].scores_latency
+        even = all(schedule.clock.is_even for schedule in schedules)
+        return clock.ticks_per_ns, clock.frame_ticks, scored, even
+
+
+def _merged(parts: Iterable[_Part], frames: int) -> Iterator[list[_Part]]:
+    """Parts that are together about no larger than one may be."""
+    some: list[_Part] = []
+    pending = 0
+    for part in parts:
+        if some and pending + len(part) > frames:
+            yield some
+            some, pending = [], 0
+        some.append(part)
+        pending += len(part)
+    if some:
+        yield some
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,22 +447,28 @@ def _absent(recording: Recording) -> int:
 class _Scoring:
     """How groups of runs are scored: the arguments of :func:`evaluate_groups`."""
 
-    metadata: Metadata
     forecasters: Mapping[str, AnyFactory]
     sigmas: Sequence[Fraction]
     convention: Convention
     costs: Mapping[str, int]
-    curves_at: int
-    observers: Sequence[Observer]
-    observed: Collection[tuple[str, Fraction]]
+    curves_at: int = 0
+    observers: Sequence[Observer] = ()
+    observed: Collection[tuple[str, Fraction]] = ()
 
-    def of(self, runs: Sequence[Run], offline: Sequence[_Offline]) -> Evaluation:
-        """Score some runs at once."""
-        schedules = [run.schedule for run in runs]
-        costs = {self.costs.get(name, 0) for name in self.forecasters}
-        pairings = {cost: pair(schedules, self.sigmas, cost) for cost in sorted({0, *costs})}
+    def __post_init__(self) -> None:
+        if not self.forecasters:
+            raise LaeError("name at least one forecaster, such as hold")
+
+    def of(
+        self, parts: Sequence[_Part], offline: Mapping[Recording, _Offline]
+    ) -> Iterator[Evaluation]:
+        """Score some parts at once; each as it is alone."""
+        runs = [run for part in parts for run in part.runs]
+        names = [(part.metadata, run.recording.name) for part in parts for run in part.runs]
+        sizes = [metadata.image_sizes(name) for metadata, name in names]
+        pairings = self._paired(runs, {0})
         kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs]
-        scored = self._scored(runs, pairings, kept)
+        scored = self._scored(runs, sizes, pairings, kept)
         scores = {m: np.stack([each.scores[m] for each in scored]) for m in METRICS}
         failure = np.stack([each.failure for each in scored])
         of_sequence = np.broadcast_to(np.arange(len(runs))[:, None], failure.shape)
@@ -386,27 +477,46 @@ class _Scoring:
             one = ScoredRun(run, kept[place], place, self.sigmas, pairings)
             for observer in self.observers:
                 observer(one)
-        return Evaluation(
-            replay=_replay_statistics(runs, offline, pairings[0]),
-            staleness=Staleness.of(pairings[0]),
-            scores=scores,
-            failure=failure,
-            failure_time=np.where(failure < 0, -1.0, failed_at),
-            curves=Curves(
-                np.stack([each.success for each in scored]),
-                np.stack([each.precision for each in scored]),
-            ),
-            offline=dict(zip(METRICS, np.array([each.scores for each in offline]).T)),
-            offline_curves=Curves(
-                np.stack([each.success for each in offline]),
-                np.stack([each.precision for each in offline]),
-            ),
-            modelled=self._modelled(runs, scores),
+        alone = [offline[run.recording] for run in runs]
+        replay = _replay_statistics(runs, alone, pairings[0])
+        staleness = Staleness.of(pairings[0])
+        failure_time = np.where(failure < 0, -1.0, failed_at)
+        curves, offline_curves = (
+            Curves(
+                np.stack([each.success for each in some]),
+                np.stack([each.precision for each in some]),
+            )
+            for some in (scored, alone)
         )
+        offline_scores = np.array([each.scores for each in alone]).T
+        outcomes = self._outcomes(runs, sizes, scores)
+        end = 0
+        for part in parts:
+            begin, end = end, end + len(part.runs)
+            own = slice(begin, end)
+            of_part = {m: _piece(scores[m], own, 1) for m in METRICS}
+            yield Evaluation(
+                replay=replay.chosen(np.arange(begin, end)),
+                staleness=_pieces(staleness, own),
+                scores=of_part,
+                failure=_piece(failure, own, 1),
+                failure_time=_piece(failure_time, own, 1),
+                curves=_pieces(curves, own, 1),
+                offline=dict(zip(METRICS, offline_scores[:, own])),
+                offline_curves=_pieces(offline_curves, own),
+                modelled=modelled_scores(part.runs, of_part, outcomes[own]),
+            )
+
+    def _paired(self, runs: Sequence[Run], besides: Collection[int] = ()) -> dict[int, Pairing]:
+        """The runs' outputs and queries at each cost that a forecaster has, and besides."""
+        schedules = [run.schedule for run in runs]
+        costs = {*besides, *(self.costs.get(name, 0) for name in self.forecasters)}
+        return {cost: pair(schedules, self.sigmas, cost) for cost in sorted(costs)}
 
     def _scored(
         self,
         runs: Sequence[Run],
+        image_sizes: Sequence[ImageSizes | None],
         pairings: Mapping[int, Pairing],
         kept: Sequence[dict[tuple[str, Fraction], Answers]],
     ) -> list[Scored]:
@@ -415,13 +525,18 @@ class _Scoring:
         scored = []
         for name, factory in self.forecasters.items():
             pairing = pairings[self.costs.get(name, 0)]
-            parts = _answers(runs, self.metadata, pairing, name, factory)
+            parts = _answers(runs, image_sizes, pairing, name, factory)
             parts = self._observed(parts, pairing, name, kept)
             scored.append(scorer.of(parts, len(self.sigmas), self.curves_at))
         return scored
 
-    def _modelled(self, runs: Sequence[Run], recorded: Mapping[str, Floats]) -> ModelledScores:
-        """The scores under the search model; its outcomes are scored as runs are."""
+    def _outcomes(
+        self,
+        runs: Sequence[Run],
+        image_sizes: Sequence[ImageSizes | None],
+        recorded: Mapping[str, Floats],
+    ) -> list[dict[str, Floats]]:
+        """The scores of the outcomes of the search model (see :func:`modelled_scores`)."""
         scores: list[dict[str, Floats]] = []
         others = []
         for s, run in enumerate(runs):
@@ -434,16 +549,15 @@ class _Scoring:
             for r, each in enumerate(boxes):
                 if not np.array_equal(each, run.boxes):
                     others.append((s, r, replace(run, boxes=each)))
-        costs = {self.costs.get(name, 0) for name in self.forecasters}
         unobserved, places = replace(self, observed=()), iter(others)
         for group in batched([run for *_, run in others], GROUP_FRAMES, BESIDE):
-            schedules = [run.schedule for run in group]
-            pairings = {cost: pair(schedules, self.sigmas, cost) for cost in costs}
-            scored = unobserved._scored(group, pairings, [])
-            for i, (s, r, _) in enumerate(islice(places, len(group))):
+            here = [*islice(places, len(group))]
+            sizes = [image_sizes[s] for s, *_ in here]
+            scored = unobserved._scored(group, sizes, self._paired(group), [])
+            for i, (s, r, _) in enumerate(here):
                 for metric in MODELLED:
                     scores[s][metric][:, r] = [each.scores[metric][i] for each in scored]
-        return modelled_scores(runs, recorded, scores)
+        return scores
 
     def _observed(
         self,
@@ -512,7 +626,8 @@ def answers(
 ) -> Answers:
     """What a forecaster answers for every world frame of one run."""
     pairing = pair([run.schedule], [sigma], cost_ns)
-    (part,) = _answers([run], metadata, pairing, name, factory)
+    sizes = metadata.image_sizes(run.recording.name)
+    (part,) = _answers([run], [sizes], pairing, name, factory)
     ((_, only),) = _answers_at(0, pairing, part)
     return only
 
@@ -568,7 +683,7 @@ def lanes_of(
 
 def _answers(
     runs: Sequence[Run],
-    metadata: Metadata,
+    image_sizes: Sequence[ImageSizes | None],
     pairing: Pairing,
     name: str,
     factory: AnyFactory,
@@ -582,7 +697,6 @@ def _answers(
         raise LaeError(
             f"{name} sees frames when they arrive: not before, as sigma < 0 would have it"
         )
-    image_sizes = [metadata.image_sizes(run.recording.name) for run in runs]
     with explained(name):
         factories = (
             [factory.for_sequence(run.recording) for run in runs]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
+from itertools import groupby
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
 from lae_sim.replay.passes import split_passes
 from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
-from lae_sim.trace.file import Trace
+from lae_sim.trace.file import HELD_FRAMES, Trace
 from lae_sim.trace.metadata import ImageSizes
 from lae_sim.trace.recording import BESIDE, Recording, batched
 
@@ -333,29 +334,7 @@ class Runs:
         return self.trace if self.timing is None else self.timing
 
     def __iter__(self) -> Iterator[Run]:
-        for jobs, services in self._groups():
-            yield from _replayed(jobs, services, self.policy)
-
-    def _groups(self) -> Iterator[tuple[list[_Job], list[Service]]]:
-        """Jobs with their services, as many as can be scheduled at once and be in memory.
-
-        A user's own policy or source sees one sequence after another: each is replayed before the
-        source is asked for the next.
-        """
-        jobs: list[_Job] = []
-        services: list[Service] = []
-        pending = 0
-        for job in self._jobs():
-            with explained("latency"):
-                service = self.source(job.times)
-            jobs.append(job)
-            services.append(service)
-            pending += len(job) + BESIDE
-            if pending >= _GROUP_FRAMES or not batchable([service], self.policy):
-                yield jobs, services
-                jobs, services, pending = [], [], 0
-        if jobs:
-            yield jobs, services
+        return (run for _, run in replay_together([self], _GROUP_FRAMES))
 
     def _jobs(self) -> Iterator[_Job]:
         """Each recording of the trace with those of the same name in the other traces."""
@@ -396,6 +375,58 @@ def check_rate(trace: Trace, fps: Fraction) -> None:
             f"frames/s: for {fps} frames/s forget the arrivals, and space the frames evenly: "
             "--forget-arrivals (forget_arrivals = true)"
         )
+
+
+def replay_together(
+    replays: Sequence[Runs], frames: int = HELD_FRAMES
+) -> Iterator[tuple[int, Run]]:
+    """The runs of some replays, one after another; those of the same rules are scheduled at once.
+
+    Args:
+        replays: any of them.
+        frames: about how many world frames are in memory, and scheduled, at once.
+
+    Yields:
+        The place of the replay, and the run.
+
+    Raises:
+        LaeError: as iterating over each of them.
+    """
+
+    def rules(placed: tuple[int, Runs]) -> tuple[Policy, Clock, bool]:
+        runs = placed[1]
+        return runs.policy, runs.clock, runs.arrivals == "recorded"
+
+    for (policy, *_), alike in groupby(enumerate(replays), rules):
+        for places, jobs, services in _groups(alike, policy, frames):
+            yield from zip(places, _replayed(jobs, services, policy))
+
+
+def _groups(
+    replays: Iterable[tuple[int, Runs]], policy: Policy, frames: int
+) -> Iterator[tuple[list[int], list[_Job], list[Service]]]:
+    """Jobs with the places of their replays and with their services.
+
+    They are as many as can be scheduled at once and be in memory. A user's own policy or source
+    sees one sequence after another: each is replayed before the source is asked for the next.
+    """
+    places: list[int] = []
+    jobs: list[_Job] = []
+    services: list[Service] = []
+    pending = 0
+    for place, runs in replays:
+        for job in runs._jobs():
+            with explained("latency"):
+                service = runs.source(job.times)
+            places.append(place)
+            jobs.append(job)
+            services.append(service)
+            pending += len(job) + BESIDE
+            if pending >= frames or not batchable([service], policy):
+                yield places, jobs, services
+                places, jobs, services, pending = [], [], [], 0
+    if jobs:
+        yield places, jobs, services
 
 
 def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[int, Run]]:
