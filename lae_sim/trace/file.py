@@ -154,7 +154,7 @@ def held(trace: Trace, frames: int = HELD_FRAMES) -> Trace:
     """
     if trace.frames is None or trace.frames > frames:
         return trace
-    return replace(trace, recordings=list(trace))
+    return replace(trace, recordings=[*iter(trace)])  # list(trace) would ask for its length
 
 
 def validate(path: str | os.PathLike[str]) -> None:
