@@ -214,6 +214,8 @@ def _before(recording: Recording, stride: Fraction) -> Ints:
     if stride > 1:
         return followed(stride, len(recording))
     processed = ~np.isnan(recording.boxes[:, 0])
+    if processed.all():
+        return np.arange(-1, len(processed) - 1)
     latest_one = np.maximum.accumulate(np.where(processed, np.arange(len(processed)), -1))
     return np.concatenate([[-1], latest_one[:-1]])
 

@@ -297,8 +297,9 @@ class _StoredRecordings:
     def describe(self) -> tuple[Metadata, int, frozenset[str]]:
         """The file's metadata, its number of rows, and the optional columns that it has."""
         with self._opened() as file:
-            check_schema(file.schema_arrow, self.path)
-            stored = (file.schema_arrow.metadata or {}).get(b"lae_sim")
+            schema = file.schema_arrow
+            check_schema(schema, self.path)
+            stored = (schema.metadata or {}).get(b"lae_sim")
             if stored is None:
                 raise TraceError(
                     f"{self.path}: metadata key 'lae_sim' is missing: is this a lae_sim trace? "
@@ -306,7 +307,7 @@ class _StoredRecordings:
                 )
             Budget(self.path, TraceError).take(json_memory(stored))
             try:
-                columns = frozenset(OPTIONAL_COLUMNS).intersection(file.schema_arrow.names)
+                columns = frozenset(OPTIONAL_COLUMNS).intersection(schema.names)
                 return Metadata.parse(stored), file.metadata.num_rows, columns
             except TraceError as error:
                 raise TraceError(f"{self.path}: {error}") from error
@@ -369,7 +370,8 @@ class _StoredRecordings:
 
     def _rows(self) -> Iterator[Rows]:
         with self._opened() as file:
-            present = [name for name in COLUMN_TYPES if name in file.schema_arrow.names]
+            names = frozenset(file.schema_arrow.names)  # made anew each time
+            present = [name for name in COLUMN_TYPES if name in names]
             groups = [file.metadata.row_group(g) for g in range(file.num_row_groups)]
             if sum(group.num_rows for group in groups) != file.metadata.num_rows:
                 raise TraceError(f"{self.path}: the file is damaged: its row counts disagree")
