@@ -28,7 +28,7 @@ from lae_sim.errors import LaeError
 MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
 _NEVER = 2**62
 _WIDE = 8  # from so many sigmas on, reduceat is slower than a loop over the sequences
-_CELLS = 1 << 17  # outputs x sigmas at once, so that they stay in the cache
+_SHORT = 1 << 15  # frames whose squares fit in 32 bits
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,10 @@ class Pairing:
             spans = map(slice, self.offsets[:-1].tolist(), self.offsets[1:].tolist())
             for s, span in enumerate(spans):  # so few that what is made of them is in the cache
                 answered = self.end[span] - self.first[span]
-                gaps.source_sum[s] = self.frames[span] @ answered
+                frames = self.frames[span]
+                if self.lengths[s] < _SHORT:  # faster: that of 64 bits is not vectorised
+                    frames = frames.astype(np.int32)
+                gaps.source_sum[s] = np.einsum("o,om->m", frames, answered)
                 gaps.mismatch[s] = (self.end[span] - self._nexts[span, None]).max(axis=0)
                 gaps.hold[s] = answered.max(axis=0)
         return gaps
@@ -315,16 +318,18 @@ def _first_visible(steps: Ints, sigmas: Ints, scale: int, lengths: Ints) -> Fram
     """ceil((K - m) / b), within 0..T, for each output and sigma; without a division for each."""
     frame, rest = np.divmod(steps, scale)
     whole, part = np.divmod(sigmas, scale)
-    frame = np.clip(frame, -MOST_FRAMES, MOST_FRAMES).astype(np.int32)[:, None]
-    rest, whole, limit = rest[:, None], whole.astype(np.int32), lengths.astype(np.int32)[:, None]
-    first = np.empty((len(steps), len(sigmas)), np.int32)
-    rows = max(_CELLS // len(sigmas), 1)
-    for begin in range(0, len(steps), rows):
-        now = slice(begin, begin + rows)
-        some = np.subtract(frame[now], whole, out=first[now])
-        some += rest[now] > part
-        np.maximum(some, 0, out=some)
-        np.minimum(some, limit[now], out=some)
+    frame = np.clip(frame, -MOST_FRAMES, MOST_FRAMES).astype(np.int32)
+    whole = whole.astype(np.int32)
+    # what is added to the frame: looked up where there are fewer kinds of it than outputs
+    places = np.arange(scale) if scale < len(steps) else rest
+    first = np.subtract(places[:, None] > part, whole, dtype=np.int32)
+    least, most = int(-whole.max()), int(1 - whole.min())
+    if places is not rest:
+        first = first.take(rest, axis=0, mode="clip")
+    first += frame[:, None]
+    limit = lengths.astype(np.int32)
+    beyond = np.flatnonzero((frame < -least) | (frame > limit - most))
+    first[beyond] = np.clip(first[beyond], 0, limit[beyond, None])
     return first
 
 
@@ -384,15 +389,18 @@ def histories(pairing: Pairing, memoryless: bool = False) -> Histories:
     look at the latest output alone, one history of all outputs serves every sigma.
     """
     count = len(pairing.sigmas)
-    if not memoryless and compiled():
+    if memoryless:
+        of_all = np.arange(len(pairing.lengths))
+        sigma_from, sigma_to = np.zeros_like(of_all), np.full_like(of_all, count)
+        output = np.arange(len(pairing.frames))
+        return Histories(of_all, sigma_from, sigma_to, pairing.offsets, output)
+    if compiled():
         return _histories_by_kernel(pairing)
     used = pairing.end > pairing.first
     used[pairing.offsets[:-1]] = True  # every forecaster starts from the initial box
     begins = np.zeros((len(pairing.lengths), count), np.bool_)
     begins[:, 0] = True
-    if memoryless:
-        used[:] = True
-    elif count > 1:
+    if count > 1:
         begins[:, 1:] = np.logical_or.reduceat(used[:, 1:] != used[:, :-1], pairing.offsets[:-1])
     sequence, sigma_from, sigma_to = _shared_ranges(begins)
     sizes = np.diff(pairing.offsets)[sequence]
