@@ -6,9 +6,8 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
-from itertools import groupby, islice
-from operator import itemgetter
-from typing import Any, TypeAlias, TypeVar
+from itertools import islice
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
@@ -20,10 +19,10 @@ from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_score
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scored, Scorer
 from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
-from lae_sim.replay.run import Run
+from lae_sim.replay.run import Run, RunBatch, distinct, grouped
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes, Metadata
-from lae_sim.trace.recording import BESIDE, Recording, batched
+from lae_sim.trace.recording import Recording
 
 Record = TypeVar("Record", "Staleness", "Curves")
 
@@ -42,6 +41,7 @@ class ReplayStatistics:
 
     Attributes:
         sequences: names, S of them.
+        repetition: see :class:`lae_sim.replay.run.RunBatch`, int64 [S].
         frames: world frames of each, int64 [S].
         truthless: world frames of each that have no ground truth, int64 [S].
         absent: world frames of each whose target is said to be absent though they have a truth,
@@ -61,6 +61,7 @@ class ReplayStatistics:
     """
 
     sequences: tuple[str, ...]
+    repetition: Ints
     frames: Ints
     truthless: Ints
     absent: Ints
@@ -192,17 +193,6 @@ def _joined(records: Sequence[Record], axis: int = 0) -> Record:
     return type(first)(*(np.concatenate(column, axis) for column in columns))
 
 
-def _pieces(record: Record, span: slice, axis: int = 0) -> Record:
-    """A span of each of a record's arrays."""
-    columns = (getattr(record, field.name) for field in fields(record))
-    return type(record)(*(_piece(column, span, axis) for column in columns))
-
-
-def _piece(values: Any, span: slice, axis: int = 0) -> Any:
-    """A span of an array, in one piece: sums over it are those over an array of its own."""
-    return np.ascontiguousarray(values[(slice(None),) * axis + (span,)])
-
-
 @dataclass(frozen=True, eq=False)
 class Answers:
     """The answer for every world frame of one sequence at one sigma.
@@ -302,7 +292,10 @@ def evaluate_groups(
     Raises:
         LaeError: as :func:`evaluate_runs`.
     """
+    if not forecasters:
+        raise LaeError("name at least one forecaster, such as hold")
     scoring = _Scoring(
+        metadata,
         forecasters,
         sigmas,
         convention,
@@ -311,88 +304,13 @@ def evaluate_groups(
         observers,
         observed,
     )
-    offline: dict[Recording, _Offline] = {}
-    for group in batched(runs, frames, BESIDE):
-        offline = _offline([run.recording for run in group], convention, offline)
-        yield from scoring.of([_Part(metadata, group)], offline)
-    if not offline:
+    known: _Known | None = None
+    for group in grouped(runs, frames):
+        if known is None or not known.places.keys() >= set(group.recordings):
+            known = _Known.of(group.distinct[0], convention, known)
+        yield scoring.of(group, known)
+    if known is None:
         raise LaeError("there is nothing to evaluate: no sequences")
-
-
-def evaluate_together(
-    runs: Iterable[tuple[int, Run]],
-    metadata: Sequence[Metadata],
-    forecasters: Mapping[str, AnyFactory],
-    sigmas: Sequence[Fraction],
-    convention: Convention = PYSOT,
-    costs: Mapping[str, int] | None = None,
-    frames: int = GROUP_FRAMES,
-) -> Iterator[tuple[int, Evaluation]]:
-    """The groups of :func:`evaluate_groups` of several replays; small groups are scored at once.
-
-    Args:
-        runs: each with the place of its replay, in the order of the replays.
-        metadata: of the trace of each replay.
-        forecasters, sigmas, convention, costs, frames: see :func:`evaluate_groups`.
-
-    Yields:
-        The place of the replay, and a group of its sequences.
-
-    Raises:
-        LaeError: if there is no forecaster, or whatever iterating over the runs raises.
-    """
-    scoring = _Scoring(forecasters, sigmas, convention, costs or {})
-    parts = (
-        _Part(metadata[place], group, place)
-        for place, own in groupby(runs, itemgetter(0))
-        for group in batched((run for _, run in own), frames, BESIDE)
-    )
-    offline: dict[Recording, _Offline] = {}
-    for _, alike in groupby(parts, _Part.way):
-        for some in _merged(alike, frames):
-            recordings = [run.recording for part in some for run in part.runs]
-            offline = _offline(recordings, convention, offline)
-            yield from zip((part.place for part in some), scoring.of(some, offline))
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Runs of one replay that are scored at once.
-
-    Attributes:
-        metadata: of the trace.
-        runs: some of the replay's.
-        place: the replay's.
-    """
-
-    metadata: Metadata
-    runs: Sequence[Run]
-    place: int = 0
-
-    def __len__(self) -> int:
-        """About how many world frames take as much memory."""
-        return sum(len(run) + BESIDE for run in self.runs)
-
-    def way(self) -> tuple[int, int, bool, bool]:
-        """Parts that differ in it cannot be paired together, or not as they are alone."""
-        schedules = [run.schedule for run in self.runs]
-        clock, scored = schedules[0].clock, schedules[0].scores_latency
-        even = all(schedule.clock.is_even for schedule in schedules)
-        return clock.ticks_per_ns, clock.frame_ticks, scored, even
-
-
-def _merged(parts: Iterable[_Part], frames: int) -> Iterator[list[_Part]]:
-    """Parts that are together about no larger than one may be."""
-    some: list[_Part] = []
-    pending = 0
-    for part in parts:
-        if some and pending + len(part) > frames:
-            yield some
-            some, pending = [], 0
-        some.append(part)
-        pending += len(part)
-    if some:
-        yield some
 
 
 @dataclass(frozen=True, eq=False)
@@ -414,26 +332,57 @@ class _Offline:
     precision: Floats
 
 
-def _offline(
-    recordings: Iterable[Recording], convention: Convention, known: Mapping[Recording, _Offline]
-) -> dict[Recording, _Offline]:
-    """Those of some recordings; those of the group before may be the same, replayed again."""
-    scored = {recording: known.get(recording) for recording in recordings}
-    new = [recording for recording, value in scored.items() if value is None]
-    if new:
-        offline = Scorer(new, convention).offline()
-        scores = np.stack([offline.scores[metric][:, 0] for metric in METRICS], axis=1).tolist()
-        for r, recording in enumerate(new):
-            scored[recording] = _Offline(
-                truthless=int(np.isnan(recording.truth[:, 0]).sum()),
-                absent=_absent(recording),
-                scored=is_scored(recording.truth),
-                missing=int(np.isnan(recording.boxes[:, 0]).sum()),
-                scores=scores[r],
-                success=offline.success[r],
-                precision=offline.precision[r],
-            )
-    return {recording: value for recording, value in scored.items() if value is not None}
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """Recordings that are replayed, perhaps again and again, and what is scored of them alone.
+
+    Attributes:
+        places: of the recordings, in order.
+        offline: of each.
+        scorer: scores answers for them.
+    """
+
+    places: Mapping[Recording, int]
+    offline: Sequence[_Offline]
+    scorer: Scorer
+
+    @classmethod
+    def of(
+        cls, recordings: Sequence[Recording], convention: Convention, known: _Known | None = None
+    ) -> _Known:
+        """Of distinct recordings, some of which may be known."""
+        before = {} if known is None else dict(zip(known.places, known.offline))
+        new = [recording for recording in recordings if recording not in before]
+        scored = before | dict(zip(new, _offline(new, convention)))
+        return cls(
+            {recording: k for k, recording in enumerate(recordings)},
+            [scored[recording] for recording in recordings],
+            Scorer(recordings, convention),
+        )
+
+    def which(self, runs: RunBatch) -> Ints:
+        """The place of each run's recording, int64 [S]."""
+        return np.array([self.places[recording] for recording in runs.recordings])
+
+
+def _offline(recordings: Sequence[Recording], convention: Convention) -> list[_Offline]:
+    """What is scored of recordings alone."""
+    if not recordings:  # all are known
+        return []
+    offline = Scorer(recordings, convention).offline()
+    scores = np.stack([offline.scores[metric][:, 0] for metric in METRICS], axis=1).tolist()
+    return [
+        _Offline(
+            truthless=int(np.isnan(recording.truth[:, 0]).sum()),
+            absent=_absent(recording),
+            scored=is_scored(recording.truth),
+            missing=int(np.isnan(recording.boxes[:, 0]).sum()),
+            scores=scores[r],
+            success=offline.success[r],
+            precision=offline.precision[r],
+        )
+        for r, recording in enumerate(recordings)
+    ]
 
 
 def _absent(recording: Recording) -> int:
@@ -447,28 +396,23 @@ def _absent(recording: Recording) -> int:
 class _Scoring:
     """How groups of runs are scored: the arguments of :func:`evaluate_groups`."""
 
+    metadata: Metadata
     forecasters: Mapping[str, AnyFactory]
     sigmas: Sequence[Fraction]
     convention: Convention
     costs: Mapping[str, int]
-    curves_at: int = 0
-    observers: Sequence[Observer] = ()
-    observed: Collection[tuple[str, Fraction]] = ()
+    curves_at: int
+    observers: Sequence[Observer]
+    observed: Collection[tuple[str, Fraction]]
 
-    def __post_init__(self) -> None:
-        if not self.forecasters:
-            raise LaeError("name at least one forecaster, such as hold")
-
-    def of(
-        self, parts: Sequence[_Part], offline: Mapping[Recording, _Offline]
-    ) -> Iterator[Evaluation]:
-        """Score some parts at once; each as it is alone."""
-        runs = [run for part in parts for run in part.runs]
-        names = [(part.metadata, run.recording.name) for part in parts for run in part.runs]
-        sizes = [metadata.image_sizes(name) for metadata, name in names]
-        pairings = self._paired(runs, {0})
-        kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs]
-        scored = self._scored(runs, sizes, pairings, kept)
+    def of(self, runs: RunBatch, known: _Known) -> Evaluation:
+        """Score some runs of known recordings at once."""
+        which = known.which(runs)
+        offline = known.offline
+        costs = {self.costs.get(name, 0) for name in self.forecasters}
+        pairings = {cost: pair(runs.schedules, self.sigmas, cost) for cost in sorted({0, *costs})}
+        kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs.recordings]
+        scored = self._scored(runs, pairings, known, kept)
         scores = {m: np.stack([each.scores[m] for each in scored]) for m in METRICS}
         failure = np.stack([each.failure for each in scored])
         of_sequence = np.broadcast_to(np.arange(len(runs))[:, None], failure.shape)
@@ -477,87 +421,63 @@ class _Scoring:
             one = ScoredRun(run, kept[place], place, self.sigmas, pairings)
             for observer in self.observers:
                 observer(one)
-        alone = [offline[run.recording] for run in runs]
-        replay = _replay_statistics(runs, alone, pairings[0])
-        staleness = Staleness.of(pairings[0])
-        failure_time = np.where(failure < 0, -1.0, failed_at)
-        curves, offline_curves = (
-            Curves(
-                np.stack([each.success for each in some]),
-                np.stack([each.precision for each in some]),
-            )
-            for some in (scored, alone)
+        return Evaluation(
+            replay=_replay_statistics(runs, offline, which),
+            staleness=Staleness.of(pairings[0]),
+            scores=scores,
+            failure=failure,
+            failure_time=np.where(failure < 0, -1.0, failed_at),
+            curves=Curves(
+                np.stack([each.success for each in scored]),
+                np.stack([each.precision for each in scored]),
+            ),
+            offline=dict(zip(METRICS, np.array([each.scores for each in offline])[which].T)),
+            offline_curves=Curves(
+                np.stack([each.success for each in offline])[which],
+                np.stack([each.precision for each in offline])[which],
+            ),
+            modelled=self._modelled(runs, known, scores),
         )
-        offline_scores = np.array([each.scores for each in alone]).T
-        outcomes = self._outcomes(runs, sizes, scores)
-        end = 0
-        for part in parts:
-            begin, end = end, end + len(part.runs)
-            own = slice(begin, end)
-            of_part = {m: _piece(scores[m], own, 1) for m in METRICS}
-            yield Evaluation(
-                replay=replay.chosen(np.arange(begin, end)),
-                staleness=_pieces(staleness, own),
-                scores=of_part,
-                failure=_piece(failure, own, 1),
-                failure_time=_piece(failure_time, own, 1),
-                curves=_pieces(curves, own, 1),
-                offline=dict(zip(METRICS, offline_scores[:, own])),
-                offline_curves=_pieces(offline_curves, own),
-                modelled=modelled_scores(part.runs, of_part, outcomes[own]),
-            )
-
-    def _paired(self, runs: Sequence[Run], besides: Collection[int] = ()) -> dict[int, Pairing]:
-        """The runs' outputs and queries at each cost that a forecaster has, and besides."""
-        schedules = [run.schedule for run in runs]
-        costs = {*besides, *(self.costs.get(name, 0) for name in self.forecasters)}
-        return {cost: pair(schedules, self.sigmas, cost) for cost in sorted(costs)}
 
     def _scored(
         self,
-        runs: Sequence[Run],
-        image_sizes: Sequence[ImageSizes | None],
+        runs: RunBatch,
         pairings: Mapping[int, Pairing],
+        known: _Known,
         kept: Sequence[dict[tuple[str, Fraction], Answers]],
     ) -> list[Scored]:
         """The scores of each forecaster."""
-        scorer = Scorer([run.recording for run in runs], self.convention)
-        scored = []
+        which, scored = known.which(runs), []
         for name, factory in self.forecasters.items():
             pairing = pairings[self.costs.get(name, 0)]
-            parts = _answers(runs, image_sizes, pairing, name, factory)
+            parts = _answers(runs, self.metadata, pairing, name, factory)
             parts = self._observed(parts, pairing, name, kept)
-            scored.append(scorer.of(parts, len(self.sigmas), self.curves_at))
+            scored.append(known.scorer.of(which, parts, len(self.sigmas), self.curves_at))
         return scored
 
-    def _outcomes(
-        self,
-        runs: Sequence[Run],
-        image_sizes: Sequence[ImageSizes | None],
-        recorded: Mapping[str, Floats],
-    ) -> list[dict[str, Floats]]:
-        """The scores of the outcomes of the search model (see :func:`modelled_scores`)."""
-        scores: list[dict[str, Floats]] = []
+    def _modelled(
+        self, runs: RunBatch, known: _Known, recorded: Mapping[str, Floats]
+    ) -> ModelledScores:
+        """The scores under the search model; its outcomes are scored as runs are."""
+        scores: list[dict[str, Floats]] = [{} for _ in runs.modelled]
         others = []
-        for s, run in enumerate(runs):
-            boxes = () if run.modelled is None else run.modelled.boxes
-            scores.append(
-                {m: np.stack([recorded[m][:, s]] * len(boxes), 1) for m in MODELLED}
-                if boxes
-                else {}
-            )
+        for s, outcomes in enumerate(runs.modelled):
+            if outcomes is None:
+                continue
+            run, boxes = runs[s], outcomes.boxes
+            scores[s] = {m: np.stack([recorded[m][:, s]] * len(boxes), 1) for m in MODELLED}
             for r, each in enumerate(boxes):
                 if not np.array_equal(each, run.boxes):
                     others.append((s, r, replace(run, boxes=each)))
+        costs = {self.costs.get(name, 0) for name in self.forecasters}
         unobserved, places = replace(self, observed=()), iter(others)
-        for group in batched([run for *_, run in others], GROUP_FRAMES, BESIDE):
-            here = [*islice(places, len(group))]
-            sizes = [image_sizes[s] for s, *_ in here]
-            scored = unobserved._scored(group, sizes, self._paired(group), [])
-            for i, (s, r, _) in enumerate(here):
+        for group in grouped([run for *_, run in others], GROUP_FRAMES):
+            pairings = {cost: pair(group.schedules, self.sigmas, cost) for cost in costs}
+            scored = unobserved._scored(group, pairings, known, [])
+            for i, (s, r, _) in enumerate(islice(places, len(group))):
                 for metric in MODELLED:
                     scores[s][metric][:, r] = [each.scores[metric][i] for each in scored]
-        return scores
+        return modelled_scores(runs, recorded, scores)
 
     def _observed(
         self,
@@ -576,44 +496,47 @@ class _Scoring:
 
 
 def _replay_statistics(
-    runs: Sequence[Run], offline: Sequence[_Offline], pairing: Pairing
+    runs: RunBatch, offline: Sequence[_Offline], which: Ints
 ) -> ReplayStatistics:
-    elapsed = [run.schedule.elapsed_ns for run in runs]
+    """Those of some runs, with what is scored of recordings alone, and which of them each is of."""
+    schedules = runs.schedules
+    firsts = schedules.offsets[:-1]
+    elapsed = (schedules.ready - schedules.start) // schedules.clocks[0].ticks_per_ns
+    init_ns = elapsed[firsts]
+    rates = np.full(len(elapsed), np.inf)
+    np.divide(1e9, elapsed, out=rates, where=elapsed > 0)
+    # zeros in place of initialisations: what is summed up are the other calls, in their order
+    elapsed[firsts], rates[firsts] = 0, 0.0
     return ReplayStatistics(
-        sequences=tuple(run.recording.name for run in runs),
-        frames=pairing.lengths,
-        truthless=np.array([each.truthless for each in offline], np.int64),
-        absent=np.array([each.absent for each in offline], np.int64),
-        scored=np.array([each.scored for each in offline]),
-        missing=np.array([each.missing for each in offline], np.int64),
-        processed=np.diff(pairing.offsets),
-        scores_latency=np.array([run.schedule.scores_latency for run in runs]),
-        departures=np.array([run.departures for run in runs], np.int64),
-        disagreement=np.array([run.disagreement for run in runs]),
-        init_ns=np.array([each[0] for each in elapsed], np.int64),
+        sequences=tuple(recording.name for recording in runs.recordings),
+        repetition=runs.repetition,
+        frames=schedules.lengths,
+        truthless=np.array([each.truthless for each in offline], np.int64)[which],
+        absent=np.array([each.absent for each in offline], np.int64)[which],
+        scored=np.array([each.scored for each in offline])[which],
+        missing=np.array([each.missing for each in offline], np.int64)[which],
+        processed=np.diff(schedules.offsets),
+        scores_latency=schedules.scores_latency,
+        departures=runs.departures,
+        disagreement=runs.disagreement,
+        init_ns=init_ns,
         left_search=_left_search(runs),
-        calls_ns=np.array([each[1:].sum() for each in elapsed], np.int64),
-        calls_hz=np.array([_rates(each[1:]).sum() for each in elapsed]),
+        calls_ns=np.add.reduceat(elapsed, firsts),
+        calls_hz=np.add.reduceat(rates, firsts),
     )
 
 
-def _left_search(runs: Sequence[Run]) -> Bools:
+def _left_search(runs: RunBatch) -> Bools:
     """Whether the target leaves the search region during each initialisation, bool [S]."""
     # of a run that processes nothing more, and of one that skips nothing, frame 0: no distance
-    resumed = [int(run.schedule.frames[1:2].sum()) for run in runs]
-    truth = [
-        run.recording.truth[[0, frame if frame > 1 else 0]] for run, frame in zip(runs, resumed)
-    ]
-    initial, then = np.array(truth).transpose(1, 0, 2)
+    offsets, frames = runs.schedules.offsets, runs.schedules.frames
+    resumed = np.where(np.diff(offsets) > 1, frames.take(offsets[:-1] + 1, mode="clip"), 0)
+    resumed[resumed == 1] = 0
+    truths = [recording.truth for recording in runs.recordings]
+    initial = np.array([truth[0] for truth in truths])
+    then = np.array([truth[frame] for truth, frame in zip(truths, resumed.tolist())])
     left: Bools = search_distance(initial, then) >= 1
     return left
-
-
-def _rates(elapsed_ns: Ints) -> Floats:
-    """Frames per second of each call, infinite for one that took no time."""
-    rates = np.full(len(elapsed_ns), np.inf)
-    np.divide(1e9, elapsed_ns, out=rates, where=elapsed_ns > 0)
-    return rates
 
 
 def answers(
@@ -626,8 +549,7 @@ def answers(
 ) -> Answers:
     """What a forecaster answers for every world frame of one run."""
     pairing = pair([run.schedule], [sigma], cost_ns)
-    sizes = metadata.image_sizes(run.recording.name)
-    (part,) = _answers([run], [sizes], pairing, name, factory)
+    (part,) = _answers(RunBatch.of([run]), metadata, pairing, name, factory)
     ((_, only),) = _answers_at(0, pairing, part)
     return only
 
@@ -647,10 +569,10 @@ def _answers_at(m: int, pairing: Pairing, part: PairedBoxes) -> Iterator[tuple[i
 
 
 def lanes_of(
-    runs: Sequence[Run],
+    runs: RunBatch,
     pairing: Pairing,
     fed: Histories,
-    image_sizes: Sequence[ImageSizes | None],
+    metadata: Metadata | None,
 ) -> Lanes:
     """What forecasters are fed in some histories of some runs.
 
@@ -658,16 +580,20 @@ def lanes_of(
         runs: those that were paired.
         pairing: of their schedules.
         fed: histories of the pairing.
-        image_sizes: of each run; None = unknown.
+        metadata: of the trace, for the sizes of images; None = unknown.
     """
-    boxes = np.concatenate([run.boxes for run in runs])
     numbers = pairing.frames.take(fed.output)
     frames = pairing.frame_times(np.repeat(fed.sequence, np.diff(fed.offsets)), numbers)
-    fed_boxes = boxes.take(fed.output, axis=0)
-    first = [(np.inf, np.inf) if sizes is None else sizes.at(0) for sizes in image_sizes]
+    fed_boxes = runs.boxes.take(fed.output, axis=0)
+    recordings, which = runs.distinct
+    first = np.full((len(recordings), 2), np.inf)
     resized: dict[int, ImageSizes] = {}
-    for s, sizes in enumerate(image_sizes):
-        if sizes is not None and sizes.change:
+    for k, recording in enumerate(recordings if metadata is not None else ()):
+        sizes = metadata.image_sizes(recording.name)
+        if sizes is None:
+            continue
+        first[k] = sizes.at(0)
+        for s in np.flatnonzero(which == k) if sizes.change else ():
             starts = pairing.frame_times(np.full(len(sizes.starts), s), np.array(sizes.starts))
             timed = ImageSizes(tuple(starts.tolist()), sizes.sizes)
             resized |= {int(lane): timed for lane in np.flatnonzero(fed.sequence == s)}
@@ -675,15 +601,15 @@ def lanes_of(
         fed.offsets,
         frames,
         fed_boxes,
-        np.array(first, np.float64)[fed.sequence],
+        first[which[fed.sequence]],
         None if frames is numbers else numbers,
         resized,
     )
 
 
 def _answers(
-    runs: Sequence[Run],
-    image_sizes: Sequence[ImageSizes | None],
+    runs: RunBatch,
+    metadata: Metadata,
     pairing: Pairing,
     name: str,
     factory: AnyFactory,
@@ -697,28 +623,29 @@ def _answers(
         raise LaeError(
             f"{name} sees frames when they arrive: not before, as sigma < 0 would have it"
         )
+    recordings, which = runs.distinct
     with explained(name):
-        factories = (
-            [factory.for_sequence(run.recording) for run in runs]
+        own = (
+            [factory.for_sequence(recording) for recording in recordings]
             if isinstance(factory, SequenceFactory)
-            else [factory] * len(runs)
+            else [factory] * len(recordings)
         )
+        factories, of_recording = distinct(own)
+    factory_of = of_recording[which]
     for fed in histories(pairing, memoryless=defines(factory, "memoryless")).parts(_PART):
         paired = pairs(pairing, fed)
-        lanes = lanes_of(runs, pairing, fed, image_sizes)
+        lanes = lanes_of(runs, pairing, fed, metadata)
         frame: Ints | Floats = paired.frame
         number: Ints | None = None
         if lanes.numbers is not None:
             sequence = fed.sequence.take(lanes.lane(paired.item))
             frame, number = pairing.frame_times(sequence, paired.frame), paired.frame
-        distinct = {id(one): one for one in factories}.values()
-        if len(distinct) == 1:
+        if len(factories) == 1:
             yield fed, paired, forecast(factories[0], lanes, paired.item, frame, name, number)
             continue
         answered = np.empty((len(paired.item), 4))
-        for one in distinct:  # at once where several sequences share one
-            chosen = np.array([other is one for other in factories])[fed.sequence]
-            part, asked, item = lanes.chosen(chosen, paired.item)
+        for k, one in enumerate(factories):  # at once where several sequences share one
+            part, asked, item = lanes.chosen(factory_of[fed.sequence] == k, paired.item)
             some = None if number is None else number[asked]
             answered[asked] = forecast(one, part, item, frame[asked], name, some)
         yield fed, paired, answered

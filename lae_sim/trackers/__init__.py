@@ -4,3 +4,7 @@ The modules of this folder run on the tracker's own interpreter: Python 3.8 or n
 whatever the tracker itself needs. Of the package they import this folder and ``lae_sim.errors``
 alone.
 """
+
+from lae_sim.trackers.stages import stage
+
+__all__ = ["stage"]

@@ -25,6 +25,7 @@ from lae_sim.trackers.protocol import (
     checked_search,
     weights_digest,
 )
+from lae_sim.trackers.stages import stage
 
 TEMPLATE, SEARCH, STRIDE = 127, 255, 16  # pixels of the two inputs, and of a step of the output
 CONTEXT = 0.5
@@ -81,8 +82,9 @@ class NanoTrack:
         x, y, w, h = checked_box(box)
         self._centre, self._size = np.array([x + w / 2, y + h / 2]), np.array([w, h])
         self._mean = cv2.mean(frame)
-        side = round(self._context_side())
-        self._template = self._features(self._crop(frame, side, TEMPLATE)).copy()
+        with stage("preprocess"):
+            patch = self._crop(frame, round(self._context_side()), TEMPLATE)
+        self._template = self._features(patch).copy()
         self._started = True
 
     def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
@@ -103,32 +105,34 @@ class NanoTrack:
         if not self._started:
             raise LaeError("nanotrack: init must come before track")
         edge = np.array(frame.shape[1::-1], float)
-        self._centre, self._size = np.clip(self._centre, 0, edge), np.minimum(self._size, edge)
-        zoom = TEMPLATE / self._context_side()
-        patch = self._crop(frame, round(SEARCH / zoom), SEARCH)
+        with stage("preprocess"):
+            self._centre, self._size = np.clip(self._centre, 0, edge), np.minimum(self._size, edge)
+            zoom = TEMPLATE / self._context_side()
+            patch = self._crop(frame, round(SEARCH / zoom), SEARCH)
         scores, sides = self._correlate(patch)
-        left, top, right, bottom = sides.astype(np.float64)
-        width, height = np.maximum(left + right, 1e-3), np.maximum(top + bottom, 1e-3)
-        # the penalty of SiamRPN on changes of shape and of size
-        w, h = self._size * zoom
-        shape, size = (width / height) / (w / h), _overall(width, height) / _overall(w, h)
-        change = np.maximum(shape, 1 / shape) * np.maximum(size, 1 / size)
-        penalty = np.exp(self._penalty * (1 - change))
-        wanted = penalty * scores * (1 - self._influence) + self._window * self._influence
-        best = np.unravel_index(int(wanted.argmax()), wanted.shape)
-        row, column = best
-        offset = np.array(
-            [
-                self._points[column] + (right[best] - left[best]) / 2,
-                self._points[row] + (bottom[best] - top[best]) / 2,
-            ]
-        )
-        rate = penalty[best] * scores[best] * self._rate
-        target_size = np.array([width[best], height[best]]) / zoom
-        self._centre = np.clip(self._centre + offset / zoom, 0, edge)
-        size = (1 - rate) * self._size + rate * target_size
-        self._size = np.clip(size, SMALLEST, np.maximum(edge, SMALLEST))
-        (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
+        with stage("postprocess"):
+            left, top, right, bottom = sides.astype(np.float64)
+            width, height = np.maximum(left + right, 1e-3), np.maximum(top + bottom, 1e-3)
+            # the penalty of SiamRPN on changes of shape and of size
+            w, h = self._size * zoom
+            shape, size = (width / height) / (w / h), _overall(width, height) / _overall(w, h)
+            change = np.maximum(shape, 1 / shape) * np.maximum(size, 1 / size)
+            penalty = np.exp(self._penalty * (1 - change))
+            wanted = penalty * scores * (1 - self._influence) + self._window * self._influence
+            best = np.unravel_index(int(wanted.argmax()), wanted.shape)
+            row, column = best
+            offset = np.array(
+                [
+                    self._points[column] + (right[best] - left[best]) / 2,
+                    self._points[row] + (bottom[best] - top[best]) / 2,
+                ]
+            )
+            rate = penalty[best] * scores[best] * self._rate
+            target_size = np.array([width[best], height[best]]) / zoom
+            self._centre = np.clip(self._centre + offset / zoom, 0, edge)
+            size = (1 - rate) * self._size + rate * target_size
+            self._size = np.clip(size, SMALLEST, np.maximum(edge, SMALLEST))
+            (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
         return (cx - w / 2, cy - h / 2, w, h), float(scores[best])
 
     def describe(self) -> dict[str, Any]:
@@ -167,16 +171,22 @@ class NanoTrack:
         return np.asarray(patch, np.uint8)
 
     def _features(self, patch: Image) -> Array:
-        self._backbone.setInput(cv2.dnn.blobFromImage(patch))
-        return np.asarray(self._backbone.forward(), np.float32)
+        with stage("preprocess"):
+            blob = cv2.dnn.blobFromImage(patch)
+        with stage("inference"):
+            self._backbone.setInput(blob)
+            return np.asarray(self._backbone.forward(), np.float32)
 
     def _correlate(self, patch: Image) -> tuple[Array, Array]:
         """Probability [n, n], and distances left, top, right, bottom [4, n, n], pixels of patch."""
-        self._head.setInput(self._template, "input1")
-        self._head.setInput(self._features(patch), "input2")
-        (classes,), (sides,) = self._head.forward(["output1", "output2"])
-        background, target = classes.astype(np.float64)
-        return 1 / (1 + np.exp(np.clip(background - target, -500, 500))), sides
+        features = self._features(patch)
+        with stage("inference"):
+            self._head.setInput(self._template, "input1")
+            self._head.setInput(features, "input2")
+            (classes,), (sides,) = self._head.forward(["output1", "output2"])
+        with stage("postprocess"):
+            background, target = classes.astype(np.float64)
+            return 1 / (1 + np.exp(np.clip(background - target, -500, 500))), sides
 
 
 def _overall(w: Any, h: Any) -> Any:
