@@ -280,15 +280,11 @@ def pair(
     steps: Ints | None = None
     next_steps: Ints | None = None
     if all(clock.is_even for clock in set(clocks)):
-        if at_once:
-            steps = frames * scale
-        else:
-            frame, rest = np.divmod(schedules.ready + cost, interval)
-            steps = frame * scale - (-rest * scale // interval)
+        steps = frames * scale if at_once else _steps(schedules.ready + cost, interval, scale)
         steps[offsets[:-1]] = -_NEVER
         next_steps = np.append(steps[1:], _NEVER)
         next_steps[offsets[1:] - 1] = _NEVER
-        first = _first_visible(steps, m, scale, np.repeat(lengths, np.diff(offsets)))
+        first, end = _first_visible(steps, m, scale, offsets, lengths)
     else:
         permitted = [each * interval // scale for each in numerators]
         if last_ready + max(map(abs, permitted)) > MAX_INT64:
@@ -300,9 +296,7 @@ def pair(
                 for s in schedules
             ]
         )
-    end = np.empty_like(first)
-    end[:-1] = first[1:]
-    end[offsets[1:] - 1] = lengths[:, None]
+        end = _ends(first, offsets, lengths)
     return Pairing(lengths, offsets, frames, steps, next_steps, scale, m, first, end, clocks)
 
 
@@ -320,13 +314,38 @@ def _first_arrived(schedule: Schedule, visible: Ints, permitted: Ints) -> Frames
     return first
 
 
-def _first_visible(steps: Ints, sigmas: Ints, scale: int, lengths: Ints) -> Frames:
-    """ceil((K - m) / b), within 0..T, for each output and sigma; without a division for each."""
-    frame, rest = np.divmod(steps, scale)
+def _steps(ready: Ints, interval: int, scale: int) -> Ints:
+    """The step from which each output is visible, without the rule for the initial box."""
+    if compiled():
+        from lae_sim.evaluation.kernels import first_steps
+
+        steps = np.empty_like(ready)
+        first_steps(ready, interval, scale, steps)
+        return steps
+    frame, rest = np.divmod(ready, interval)
+    rounded_up: Ints = frame * scale - (-rest * scale // interval)
+    return rounded_up
+
+
+def _first_visible(
+    steps: Ints, sigmas: Ints, scale: int, offsets: Ints, lengths: Ints
+) -> tuple[Frames, Frames]:
+    """ceil((K - m) / b), within 0..T, for each output and sigma, and where the next one's is.
+
+    There is no division for each sigma.
+    """
     whole, part = np.divmod(sigmas, scale)
-    frame = np.clip(frame, -MOST_FRAMES, MOST_FRAMES).astype(np.int32)[:, None]
-    rest, whole, limit = rest[:, None], whole.astype(np.int32), lengths.astype(np.int32)[:, None]
     first = np.empty((len(steps), len(sigmas)), np.int32)
+    if compiled():
+        from lae_sim.evaluation.kernels import first_visible
+
+        end = np.empty_like(first)
+        first_visible(steps, offsets, lengths, scale, whole, part, first, end)
+        return first, end
+    frame, rest = np.divmod(steps, scale)
+    frame = np.clip(frame, -MOST_FRAMES, MOST_FRAMES).astype(np.int32)[:, None]
+    limit = np.repeat(lengths, np.diff(offsets)).astype(np.int32)[:, None]
+    rest, whole = rest[:, None], whole.astype(np.int32)
     rows = max(_CELLS // len(sigmas), 1)
     for begin in range(0, len(steps), rows):
         now = slice(begin, begin + rows)
@@ -334,7 +353,15 @@ def _first_visible(steps: Ints, sigmas: Ints, scale: int, lengths: Ints) -> Fram
         some += rest[now] > part
         np.maximum(some, 0, out=some)
         np.minimum(some, limit[now], out=some)
-    return first
+    return first, _ends(first, offsets, lengths)
+
+
+def _ends(first: Frames, offsets: Ints, lengths: Ints) -> Frames:
+    """Where each output is no longer the latest: where the next one is first, or at the end."""
+    end = np.empty_like(first)
+    end[:-1] = first[1:]
+    end[offsets[1:] - 1] = lengths[:, None]
+    return end
 
 
 @dataclass(frozen=True)

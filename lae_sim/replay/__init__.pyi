@@ -11,7 +11,7 @@ from .latency import (
     scaled,
 )
 from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
-from .run import Run, Runs, replay_repeated, replay_sequence
+from .run import Repetitions, Run, RunBatch, Runs, replay_repeated, replay_sequence
 from .search import Outcomes, SearchModel, find_search
 from .strides import followed, phases
 from .world import (
@@ -31,8 +31,10 @@ __all__ = [
     "OwnJump",
     "RandomSource",
     "Reach",
+    "Repetitions",
     "Restart",
     "Run",
+    "RunBatch",
     "Runs",
     "SearchModel",
     "TraceLike",

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from itertools import groupby
+from itertools import chain, groupby
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import RandomSource
-from lae_sim.replay.run import Run, Runs, replay_repeated, replay_together
+from lae_sim.replay.run import Repetitions, Run, RunBatch, Runs, replay_together
 from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import World, kind_of, label_of
 from lae_sim.study.rows import CellRows, RowsFile
@@ -272,18 +272,17 @@ def _score(shares: Sequence[_Share]) -> None:
         shares[place].add(part)
 
 
-def _runs(shares: Sequence[_Share]) -> Iterator[tuple[int, Run]]:
+def _runs(shares: Sequence[_Share]) -> Iterator[tuple[int, RunBatch]]:
     """The runs of each share, with its place."""
     for repeats, some in groupby(enumerate(shares), lambda each: each[1].replay.repeats):
         places, own = zip(*some)
+        replays = [share.replay for share in own]
         if repeats:
-            for place, share in zip(places, own):
-                setting = share.setting
-                for each in replay_repeated(share.replay.runs, setting.count, setting.first):
-                    yield place, share.noted(*each)
+            for place, replay in zip(places, replays):
+                yield from ((place, batch) for batch in replay.batches())
         else:
-            for i, run in replay_together([share.replay.runs for share in own]):
-                yield places[i], own[i].noted(own[i].setting.first, run)
+            for i, batch in replay_together([replay.runs for replay in replays]):
+                yield places[i], batch
 
 
 class _Share:
@@ -305,7 +304,6 @@ class _Share:
         self.replay = replayed(self.setting, trace)
         sigmas = self.setting.world.sigmas
         self._writers = [CellRows(sigmas, cell.about(trace.metadata), shared) for cell in cells]
-        self._repetitions: list[int] = []
         self._curves, self._modelled = CurveTotals(), ModelledTotals(0)
         self._kept: list[ReplayStatistics] = []
         self._departures = self._calls = 0
@@ -316,16 +314,9 @@ class _Share:
         made = tuple((name, id(factory)) for name, factory in self.factories.items())
         return self.convention.name, self.setting.world.sigmas, made, tuple(self.costs.items())
 
-    def noted(self, repetition: int, run: Run) -> Run:
-        """A run, of a repetition that is noted."""
-        self._repetitions.append(repetition)
-        return run
-
     def add(self, part: Evaluation) -> None:
-        """Take in what was scored of the runs that were noted, in their order."""
-        count = len(part.replay.sequences)
-        repetitions = np.array(self._repetitions[:count], np.int32)
-        del self._repetitions[:count]
+        """Take in what was scored of some runs."""
+        repetitions = part.replay.repetition.astype(np.int32)
         for f, writer in enumerate(self._writers):
             writer.add(part, f, repetitions)
         self._curves.add(part)
@@ -417,11 +408,13 @@ class Replayed:
         return isinstance(self.runs.source, RandomSource)
 
     def __iter__(self) -> Iterator[Run]:
+        return chain.from_iterable(self.batches())
+
+    def batches(self) -> Iterator[RunBatch]:
         """All runs, repetition after repetition."""
         if self.repeats:
-            repeated = replay_repeated(self.runs, self.setting.count, self.setting.first)
-            return (run for _, run in repeated)
-        return iter(self.runs)
+            return Repetitions(self.runs, self.setting.count, self.setting.first).batches()
+        return self.runs.batches()
 
 
 def replayed(setting: Setting, trace: Trace) -> Replayed:

@@ -50,7 +50,7 @@ from lae_sim.evaluation.pairing import pair
 from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
 from lae_sim.replay.latency import LatencySource, by_frame, constant, initialised
-from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.replay.run import Run, RunBatch, replay_sequence
 from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.trace.metadata import ImageSizes, Metadata
@@ -405,7 +405,9 @@ def test_replays_that_are_scored_together_have_the_scores_that_they_have_alone(f
     of = [Metadata.new("30", "every-frame", dataset={"name": str(k)}) for k in range(4)]
     sigmas = [Fraction(0), Fraction(3, 4)]
     more = {"costs": COSTS, "frames": frames}
-    runs = ((k, run) for k, some in enumerate(replays) for run in some)
+    runs = (
+        (k, RunBatch.of(some[a:b])) for k, some in enumerate(replays) for a, b in ((0, 1), (1, 4))
+    )
     together = evaluate_together(runs, of, FORECASTERS, sigmas, **more)  # type: ignore[arg-type]
     alone = [
         (k, part)
