@@ -186,7 +186,7 @@ def test_what_a_function_makes_is_looked_at_when_it_is_made():
 
 def test_a_module_that_is_not_there_is_told_from_what_it_imports(tmp_path):
     (tmp_path / "needy_module.py").write_text("import nowhere_module\n")
-    with pytest.raises(LaeError, match="No module named 'neady'; the current folder is /"):
+    with pytest.raises(LaeError, match="No module named 'neady'; searched /"):
         imported("it", "neady:Thing")
     with pytest.raises(LaeError, match=r"No module named 'mine\.py'.*; leave out \.py"):
         imported("it", "mine.py:Damped")

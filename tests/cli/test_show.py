@@ -126,7 +126,7 @@ def test_everything_that_a_profile_says_is_shown(
         "libraries opencv 5.0.0",
         "device NVIDIA Jetson Orin Nano, memory 8.0 GiB, power mode 15W (nvpmodel 0)",
         "cpu Cortex-A78AE, cores 6",
-        "timing measured, clock perf_counter_ns, cpu share 1.87, synchronised, threads 2, warmup",
+        "timing measured, clock perf_counter_ns, used 1.9 cores, synchronised, threads 2, warmup",
         "schedule every-frame, stride 2",
         "dataset DTB70",
         "lae sim commit abababababab..., modified, version 0.2.0",
