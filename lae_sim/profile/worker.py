@@ -263,8 +263,8 @@ class Worker(_Asked):
 class InProcess(_Asked):
     """A tracker in this process: a :class:`.timed.TimedTracker`, for ``with``, to debug a tracker.
 
-    Nothing stops it when it hangs or crashes. BLAS and OpenMP keep the threads that they were loaded
-    with.
+    Nothing stops it when it hangs or crashes. BLAS and OpenMP keep the threads that they were
+    loaded with.
 
     Args:
         tracker: the tracker's name, see `lae_sim.trackers.names.make_tracker`.

@@ -49,7 +49,7 @@ _LIBRARIES = {  # module: name in a trace; that of pip, where the module does no
     "tensorflow": "tensorflow",
     "jax": "jax",
     "ncnn": "ncnn",
-    "MNN": "MNN",
+    "MNN": "mnn",
 }
 
 _ASYNCHRONOUS = ("cupy", "jax", "tensorrt")  # by default; other runtimes return arrays of the host

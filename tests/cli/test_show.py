@@ -231,6 +231,21 @@ def test_what_the_profiler_writes_fits_the_schema() -> None:
         jsonschema.validate(wrong, schema)
 
 
+def test_threads_beyond_what_was_asked_are_warned_of(
+    run: Callable[..., str], tmp_path: Path
+) -> None:
+    metadata, recordings = profiled()
+    path = tmp_path / "threads.parquet"
+    warning = "--threads 1 was not obeyed by all libraries: 1.9 cores were busy"
+    for asked, warned in ((1, True), (2, False)):
+        threads = {"asked": asked, "opencv": 1, "ncnn": "unknown"}
+        timing = {**metadata.document["timing"], "threads": threads}
+        write_trace(Trace(Metadata.of({**metadata.document, "timing": timing}), recordings), path)
+        text = " ".join(run(path).split())
+        assert (warning in text) is warned
+        assert f"threads asked {asked}, ncnn unknown, opencv 1" in text
+
+
 def test_pictures(run: Callable[..., str], full: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="pictures need it")
     run(full, SLOW, "--plot", tmp_path / "times.svg")

@@ -222,7 +222,7 @@ def test_a_module_is_still_found_and_can_be_looked_for(library: Any, watched: An
 
 @pytest.mark.parametrize(
     ("module", "name"),
-    [("ncnn", "ncnn"), ("MNN", "MNN"), ("cupy", "cupy"), ("tensorrt", "tensorrt"), ("jax", "jax")],
+    [("ncnn", "ncnn"), ("MNN", "mnn"), ("cupy", "cupy"), ("tensorrt", "tensorrt"), ("jax", "jax")],
 )
 def test_what_is_loaded_is_told(
     monkeypatch: pytest.MonkeyPatch, watched: Any, module: str, name: str
