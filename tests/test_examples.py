@@ -77,7 +77,7 @@ def test_fear_xs_fails_at_set_up_where_its_models_are_wrong(tmp_path):
 
 
 def test_fear_xs_follows_a_real_target(shared_data):
-    folder = shared_data / "frames" / "DTB70" / "MountainBike6"
+    folder = shared_data / "frames" / "OTB100" / "Couple"
     truth = np.loadtxt(folder / "groundtruth_rect.txt", delimiter=",")[:30]
     frames = [read_image(folder / "img" / f"{i + 1:05d}.jpg") for i in range(len(truth))]
     tracker = make_tracker(NAME, {"weights": str(shared_data / "weights" / "fear_xs")})
