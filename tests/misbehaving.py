@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from lae_sim.trackers import stage
+
 BOX = (10.0, 20.0, 30.0, 40.0)
 
 
@@ -192,6 +194,43 @@ class Frames:
         frame[:] = 7
         self.last, self.digest = frame, int(frame.sum())
         return found
+
+
+class Staged:
+    """Marks its stages, also in another thread, and raises within one in its third call."""
+
+    def init(self, frame: Any, box: Any) -> None:
+        self.calls = 0
+
+    def track(self, frame: Any) -> Any:
+        self.calls += 1
+        with stage("preprocess"):
+            time.sleep(0.01)
+        beside = threading.Thread(target=self.beside)
+        beside.start()
+        with stage("inference"):
+            if self.calls == 3:
+                raise ValueError("lost my mind")
+            time.sleep(0.02)
+        beside.join()
+        with stage("preprocess"):
+            pass
+        return BOX
+
+    def beside(self) -> None:
+        with stage("beside"):
+            time.sleep(0.02)
+
+
+class Misnamed:
+    """Marks a stage that no trace can name."""
+
+    def init(self, frame: Any, box: Any) -> None:
+        pass
+
+    def track(self, frame: Any) -> Any:
+        with stage("Pre-process"):
+            return BOX
 
 
 class Clockwork:

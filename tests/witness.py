@@ -472,17 +472,15 @@ def write_plain(
 
 def same(a: Recording, b: Recording) -> bool:
     """Whether two recordings are equal bit for bit."""
-    optional = ("arrival_ns", "visible")
-    if a.name != b.name or any(
-        (getattr(a, o) is None) != (getattr(b, o) is None) for o in optional
-    ):
-        return False
-    present = [field for field in optional if getattr(a, field) is not None]
-    return all(
-        getattr(a, field).dtype == getattr(b, field).dtype
-        and getattr(a, field).shape == getattr(b, field).shape
-        and getattr(a, field).tobytes() == getattr(b, field).tobytes()
-        for field in ("truth", "boxes", "elapsed_ns", "score", *present)
+    one, two = (
+        {name: getattr(r, name) for name in ("truth", "boxes", "elapsed_ns", "score")} | r.columns
+        for r in (a, b)
+    )
+    return (a.name, one.keys()) == (b.name, two.keys()) and all(
+        values.dtype == two[name].dtype
+        and values.shape == two[name].shape
+        and values.tobytes() == two[name].tobytes()
+        for name, values in one.items()
     )
 
 

@@ -28,7 +28,7 @@ TYPES: Types = {
     "score": pa.float32(),
     "arrival_ns": pa.int64(),
     "visible": pa.bool_(),
-    "stage_decode_ns": pa.int64(),
+    **{f"stage_{name}_ns": pa.int64() for name in ("decode", "inference", "warp_2")},
 }
 DOCUMENT: Document = {
     "format": "lae-trace",
@@ -119,6 +119,20 @@ def flagged(*flags: Any) -> Columns:
     return {**good(), "visible": [*flags, *[None] * 4]}
 
 
+def staged(columns: Columns, *changes: tuple[int, Any]) -> Columns:
+    """Columns with the times of stages: all of frame 1 of ``b``, nothing of frame 0 of ``a``."""
+    decode = [None, *range(1_000_000, 1_000_007)]
+    inference = [None, 0, 8_000_000, 9_000_000, None, 19_003_996, 0, None]
+    for row, value in changes:
+        inference[row] = value
+    stages = {"stage_decode_ns": decode, "stage_inference_ns": inference}
+    skipped = [ns is None for ns in columns["elapsed_ns"]]
+    return {**columns, **{
+        name: [None if skip else ns for ns, skip in zip(values, skipped)]
+        for name, values in stages.items()
+    }}  # fmt: skip
+
+
 def no_truth() -> Columns:
     """Truth that is missing in two frames."""
     columns = good()
@@ -164,9 +178,13 @@ def write_valid(folder: Path) -> None:
     write(folder / "no-score-column.parquet", without("score"))
     write(folder / "arrivals.parquet", arriving(), NEWER)
     write(folder / "flags-of-absence.parquet", flagged(True, None, False, True), NEWER)
-    stages = {"stage_decode_ns": [None, *range(1_000_000, 1_000_007)]}
+    newer_real_time = {**NEWER, "schedule": real_time["schedule"]}
+    write(folder / "stages.parquet", staged(good()), NEWER)
+    write(folder / "stages-of-a-real-time-run.parquet", staged(skipping()), newer_real_time)
+    own = {**good(), "stage_warp_2_ns": [None] * 4 + [0, 5, 6, 7]}
+    write(folder / "stage-of-ones-own.parquet", own, NEWER)
     write(folder / "all-of-1.1.parquet",
-          {**flagged(True, True, True, False), **arriving(), **stages}, NEWER)  # fmt: skip
+          staged({**flagged(True, True, True, False), **arriving()}), NEWER)  # fmt: skip
     write(folder / "zero-time.parquet", mapped(lambda _: 0, "elapsed_ns"))
     write(folder / "one-frame.parquet", rows([0]))
     write(folder / "large-string.parquet", good(), types={**TYPES, "sequence": pa.large_string()})
@@ -265,6 +283,23 @@ def write_invalid(folder: Path) -> None:
     bad("arrivals-in-milliseconds", "arrival_ns", "milliseconds", columns=in_ms, document=NEWER)
     bad("flags-as-numbers", "visible", "bool", columns=flagged(1, 1, 0, 1), document=NEWER,
         types={**TYPES, "visible": pa.int8()})  # fmt: skip
+
+    for name, row, words, change in (
+        ("stage-negative", 2, ["'a'", "frame 2", "negative"], -1),
+        ("stage-longer-than-the-call", 6, ["'b'", "frame 2", "longer"], 30_000_000),
+        ("stages-longer-together", 5, ["'b'", "frame 1", "longer"], 19_003_997),
+    ):
+        bad(name, "stage_inference_ns", *words, columns=staged(good(), (row, change)),
+            document=NEWER)  # fmt: skip
+    unprocessed = {**skipping(), "stage_decode_ns": [1000] * 8}
+    bad("stage-of-a-skipped-frame", "stage_decode_ns", "'a'", "frame 1", "not processed",
+        columns=unprocessed, document=NEWER)  # fmt: skip
+    in_seconds = {**good(), "stage_decode_ns": [0.001] * 8}
+    bad("stage-in-seconds", "stage_decode_ns", "seconds", columns=in_seconds, document=NEWER,
+        types={**TYPES, "stage_decode_ns": pa.float64()})  # fmt: skip
+    bad("stage-name", "stage_Decode_ns", "small letters", document=NEWER,
+        columns={**good(), "stage_Decode_ns": [1000] * 8},
+        types={**TYPES, "stage_Decode_ns": pa.int64()})  # fmt: skip
 
     in_ms = mapped(lambda ns: ns // 1_000_000, "elapsed_ns")
     bad("times-in-milliseconds", "elapsed_ns", "milliseconds", columns=in_ms)

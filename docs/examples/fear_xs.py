@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lae_sim.trackers import onnx_session
+from lae_sim.trackers import onnx_session, stage
 
 TEMPLATE, SEARCH, STRIDE = 128, 256, 16  # pixels of the two crops, and between points of the grid
 AROUND_TEMPLATE, AROUND_SEARCH = 0.2, 2.0  # what a crop has on each side of the box, in its sides
@@ -38,9 +38,11 @@ class FearXS:
         self.box = self.inside((cx - w / 2, cy - h / 2, w, h))
 
     def track(self, frame):
-        image, corner, scale = self.crop(frame, AROUND_SEARCH, SEARCH)
-        inputs = {"image": image, "template_features": self.template}
-        (sides,), ((logits,),) = self.network.run(["bbox", "cls"], inputs)
+        with stage("preprocess"):
+            image, corner, scale = self.crop(frame, AROUND_SEARCH, SEARCH)
+        with stage("inference"):
+            inputs = {"image": image, "template_features": self.template}
+            (sides,), ((logits,),) = self.network.run(["bbox", "cls"], inputs)
         row, column = np.unravel_index(logits.argmax(), logits.shape)
         left, top, right, bottom = sides[:, row, column].astype(float)
         place = np.array([self.points[column] - left, self.points[row] - top])

@@ -61,6 +61,7 @@ policies, by which a free tracker takes a frame:
 latencies, each perhaps with ,init=TIME for the initialisation (constant:47ms,init=800ms):
   recorded                each frame's recorded time
   by-call                 the k-th call takes the k-th recorded time
+  stage:NAME[+NAME]       the recorded times of a stage, or of several, alone (stage:inference)
   constant:TIME           the same for all calls
   resample:SEED           each call draws one of the recorded times
   lognormal:SEED          each call draws from the lognormal distribution fitted to them

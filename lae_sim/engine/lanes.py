@@ -9,7 +9,8 @@ and whatever ends in an error.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain, repeat
 from typing import cast
 
 import numpy as np
@@ -18,7 +19,14 @@ from lae_sim._arrays import Ints
 from lae_sim._compiled import compiled
 from lae_sim.engine.clock import MAX_INT64, Clock
 from lae_sim.engine.policies import CompiledPolicy, LanePolicy
-from lae_sim.engine.scheduler import Policy, Schedule, Service, scores_latency, simulate
+from lae_sim.engine.scheduler import (
+    Policy,
+    Schedule,
+    Schedules,
+    Service,
+    scores_latency,
+    simulate,
+)
 from lae_sim.engine.times import Times
 
 _CELLS = 1 << 20  # lanes x frames in memory at once, a few arrays of them
@@ -55,18 +63,38 @@ def simulate_lanes(
     Raises:
         LaeError: what ``simulate`` raises, when that sequence's turn comes.
     """
+    return chain.from_iterable(simulate_many(lengths, clock, services, policy))
+
+
+def simulate_many(
+    lengths: Sequence[int],
+    clock: Clock | Sequence[Clock],
+    services: Sequence[Service],
+    policy: Policy,
+) -> Iterator[Schedules]:
+    """The same, the schedules of many sequences in one record.
+
+    Yields:
+        Those of some sequences, then of those after them; before one that raises an error those of
+        all that come before it.
+    """
     clocks = [clock] * len(lengths) if isinstance(clock, Clock) else clock
-    schedules: Iterable[Schedule | None] = [None] * len(lengths)
+    found: Iterator[Schedules | None] = repeat(None, len(lengths))
     even = len(set(clocks)) == 1 and clocks[0].is_even
     if even and len(lengths) >= _FEWEST and min(lengths) > 0 and batchable(services, policy):
         times, rule = cast("Sequence[Times]", services), cast(LanePolicy, policy)
         numbers = _in_numbers(rule, clocks[0], max(lengths))
+        scored = scores_latency(policy)
         if numbers is not None and compiled():
-            schedules = _by_kernel(lengths, clocks[0], times, numbers, scores_latency(policy))
+            found = _by_kernel(lengths, clocks[0], times, numbers, scored)
         else:
-            schedules = _in_step(lengths, clocks[0], times, rule)
-    for length, of, service, schedule in zip(lengths, clocks, services, schedules):
-        yield schedule or simulate(length, of, service, policy)
+            found = _in_step(lengths, clocks[0], times, rule, scored)
+    done = 0
+    for some in found:
+        if some is None:
+            some = Schedules.of([simulate(lengths[done], clocks[done], services[done], policy)])
+        yield some
+        done += len(some)
 
 
 def _in_numbers(policy: LanePolicy, clock: Clock, longest: int) -> tuple[int, int] | None:
@@ -83,8 +111,8 @@ def _by_kernel(
     times: Sequence[Times],
     numbers: tuple[int, int],
     scored: bool,
-) -> Iterator[Schedule | None]:
-    """The schedules of lanes, some after some; None for those that the SimPy engine is to have."""
+) -> Iterator[Schedules | None]:
+    """The schedules of lanes, many after many; None for one that the SimPy engine is to have."""
     from lae_sim.engine.kernels import schedule_lanes
 
     begin = 0
@@ -108,27 +136,54 @@ def _by_kernel(
             rows,
             calls,
         )
-        at = 0
-        for length, count in zip(lengths[begin:end], calls.tolist()):
-            if count < 0:
-                yield None
-                continue
-            frame, start, ready = rows[:, at : at + count]
-            yield Schedule(clock, length, frame, start, ready, scored)
-            at += count
+        yield from _stretches(lengths[begin:end], clock, calls, rows, scored)
         begin = end
 
 
+def _stretches(
+    lengths: Sequence[int], clock: Clock, calls: Ints, rows: Ints, scored: bool
+) -> Iterator[Schedules | None]:
+    """The schedules of lanes up to the next one without calls, which is None, and so on.
+
+    Args:
+        lengths: of the lanes.
+        clock: of them all.
+        calls: how many each has, int64 [lanes]; none, or fewer, where SimPy is to have it.
+        rows: frames, starts and ready of the calls, lane after lane, int64 [3, ...].
+        scored: whether the policy scores latency.
+    """
+    offsets = np.concatenate([[0], np.cumsum(np.maximum(calls, 0))])
+    begin = 0
+    for end in [*np.flatnonzero(calls < 1).tolist(), len(calls)]:
+        if begin < end:
+            yield Schedules(
+                (clock,) * (end - begin),
+                np.array(lengths[begin:end], np.int64),
+                offsets[begin : end + 1] - offsets[begin],
+                *rows[:, offsets[begin] : offsets[end]],
+                np.full(end - begin, scored),
+            )
+        if end < len(calls):
+            yield None
+        begin = end + 1
+
+
 def _in_step(
-    lengths: Sequence[int], clock: Clock, times: Sequence[Times], policy: LanePolicy
-) -> list[Schedule | None]:
+    lengths: Sequence[int],
+    clock: Clock,
+    times: Sequence[Times],
+    policy: LanePolicy,
+    scored: bool,
+) -> Iterator[Schedules | None]:
     """The same by NumPy: the k-th calls of lanes of similar lengths at once."""
-    schedules: list[Schedule | None] = [None] * len(lengths)
+    calls = np.zeros(len(lengths), np.int64)
+    rows: list[Ints] = [np.empty((3, 0), np.int64)] * len(lengths)
     for lanes in _chunks(lengths):
         sizes, some = np.array([lengths[i] for i in lanes]), [times[i] for i in lanes]
-        for i, schedule in zip(lanes, _together(sizes, clock, some, policy)):
-            schedules[i] = schedule
-    return schedules
+        done, calls[lanes] = _together(sizes, clock, some, policy)
+        for k, i in enumerate(lanes):
+            rows[i] = done[:, k, : calls[i]]
+    yield from _stretches(lengths, clock, calls, np.concatenate(rows, axis=1), scored)
 
 
 def _chunks(lengths: Sequence[int]) -> Iterator[list[int]]:
@@ -144,8 +199,8 @@ def _chunks(lengths: Sequence[int]) -> Iterator[list[int]]:
 
 def _together(
     lengths: Ints, clock: Clock, times: Sequence[Times], policy: LanePolicy
-) -> list[Schedule | None]:
-    """The schedules of lanes, shortest first; None for those that the SimPy engine is to have.
+) -> tuple[Ints, Ints]:
+    """Frames, starts and ready of the calls of lanes, shortest first, and how many calls each has.
 
     ``_STEPS`` calls of all lanes are worked out in ``rows``, of which ``frames``, ``starts`` and
     ``ready`` are views, and so is what the loop writes: row ``j + 1`` of frames and starts is the
@@ -162,6 +217,9 @@ def _together(
     lane stand together. Lanes that have ended are cut off at the front, since the shortest come
     first; those among the rest work on, and what they write after their last call is left out by
     ``calls``.
+
+    Returns:
+        int64 [3, lanes, ...] and [lanes]; no calls where SimPy is to have a lane.
     """
     interval, width = clock.frame_ticks, len(lengths)
     taken = np.empty((width, int(lengths[-1]) + _STEPS), np.int64)
@@ -170,7 +228,7 @@ def _together(
         space[: len(known)], space[len(known) :] = known, -1
     longest = max(int(taken.max()), 1) * clock.ticks_per_ns
     if int(lengths[-1]) * interval + longest > MAX_INT64:
-        return [None] * width
+        return np.empty((3, width, 0), np.int64), np.zeros(width, np.int64)
     taken *= clock.ticks_per_ns
     by_call = np.array([lane.by_call for lane in times])
     all_by_call = bool(by_call.all())
@@ -217,11 +275,5 @@ def _together(
         first = int(np.append(runs, True)[first:].argmax()) + first
         frames[0], starts[0] = frames[-1], starts[-1]
         k += _STEPS
-    lane_by_lane = zip(*done)
-    scored = scores_latency(policy)
-    return [
-        None if bad else Schedule(clock, length, frames[:n], starts[:n], ready[:n], scored)
-        for (frames, starts, ready), bad, length, n in zip(
-            lane_by_lane, faulty.tolist(), lengths.tolist(), calls.tolist()
-        )
-    ]
+    calls[faulty] = 0
+    return done, calls

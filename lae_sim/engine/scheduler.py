@@ -7,7 +7,7 @@ SimPy moves the clock. See Li et al., "Predictive Visual Tracking" (2021), Eqs. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from operator import index, itemgetter
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lae_sim._arrays import Ints
+from lae_sim._arrays import Bools, Ints
 from lae_sim.engine.clock import Clock
 from lae_sim.errors import LaeError, shown
 
@@ -73,6 +73,85 @@ class Schedule:
         """Processing time of each call, int64 [n], ns."""
         elapsed: Ints = (self.ready - self.start) // self.clock.ticks_per_ns
         return elapsed
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Schedules:
+    """Schedules of S sequences, their calls one after another.
+
+    Attributes:
+        clocks: of each sequence.
+        lengths: number of world frames of each, int64 [S].
+        offsets: first call of each, and n: int64 [S + 1].
+        frames, start, ready: see :class:`Schedule`, int64 [n].
+        scores_latency: of each sequence, bool [S].
+    """
+
+    clocks: tuple[Clock, ...]
+    lengths: Ints
+    offsets: Ints
+    frames: Ints
+    start: Ints
+    ready: Ints
+    scores_latency: Bools
+
+    def __len__(self) -> int:
+        """Number of sequences S."""
+        return len(self.clocks)
+
+    def __getitem__(self, s: int) -> Schedule:
+        """That of one sequence."""
+        calls = slice(int(self.offsets[s]), int(self.offsets[s + 1]))
+        columns = self.frames[calls], self.start[calls], self.ready[calls]
+        return Schedule(
+            self.clocks[s], int(self.lengths[s]), *columns, bool(self.scores_latency[s])
+        )
+
+    def __iter__(self) -> Iterator[Schedule]:
+        """Each, in order."""
+        return map(self.__getitem__, range(len(self)))
+
+    def part(self, begin: int, end: int) -> Schedules:
+        """Those of some sequences, one after another."""
+        some, offsets = slice(begin, end), self.offsets[begin : end + 1]
+        calls = slice(offsets[0], offsets[-1])
+        return Schedules(
+            self.clocks[some],
+            self.lengths[some],
+            offsets - offsets[0],
+            self.frames[calls],
+            self.start[calls],
+            self.ready[calls],
+            self.scores_latency[some],
+        )
+
+    @classmethod
+    def of(cls, schedules: Sequence[Schedule]) -> Schedules:
+        """Some schedules, at least one, as one record."""
+        counts = [len(each.frames) for each in schedules]
+        return cls(
+            tuple(each.clock for each in schedules),
+            np.array([each.length for each in schedules], np.int64),
+            np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]),
+            np.concatenate([each.frames for each in schedules]),
+            np.concatenate([each.start for each in schedules]),
+            np.concatenate([each.ready for each in schedules]),
+            np.array([each.scores_latency for each in schedules]),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Schedules]) -> Schedules:
+        """Those of several such records as one."""
+        counts = np.concatenate([np.diff(part.offsets) for part in parts])
+        return cls(
+            tuple(chain.from_iterable(part.clocks for part in parts)),
+            np.concatenate([part.lengths for part in parts]),
+            np.concatenate([[0], np.cumsum(counts)]),
+            np.concatenate([part.frames for part in parts]),
+            np.concatenate([part.start for part in parts]),
+            np.concatenate([part.ready for part in parts]),
+            np.concatenate([part.scores_latency for part in parts]),
+        )
 
 
 def simulate(length: int, clock: Clock, service: Service, policy: Policy) -> Schedule:

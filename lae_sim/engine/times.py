@@ -9,6 +9,11 @@ from lae_sim._arrays import Ints
 from lae_sim.engine.scheduler import Service
 from lae_sim.errors import LaeError
 
+SKIPPED = (
+    "the trace has no time for it, since the tracker skipped it; use the times by call, or a trace "
+    "of every frame"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Times:
@@ -18,11 +23,13 @@ class Times:
         name: the sequence's name.
         ns: int64 [n], at most the number of world frames; -1 where there is none.
         by_call: whether the k-th call takes the k-th of them, rather than each frame its own.
+        absent: what is said of a frame that has none.
     """
 
     name: str
     ns: Ints
     by_call: bool = False
+    absent: str = SKIPPED
 
     def __call__(self, frame: int) -> int:
         """The time of the next call, which is that of a frame.
@@ -34,17 +41,16 @@ class Times:
 
     @cached_property
     def _answer(self) -> Service:
-        return (_next_time if self.by_call else _frames_own)(self.name, self.ns.tolist())
+        if self.by_call:
+            return _next_time(self.name, self.ns.tolist())
+        return _frames_own(self.name, self.ns.tolist(), self.absent)
 
 
-def _frames_own(name: str, elapsed: list[int]) -> Service:
+def _frames_own(name: str, elapsed: list[int], absent: str) -> Service:
     def look_up(frame: int) -> int:
         ns = elapsed[frame]
         if ns < 0:
-            raise LaeError(
-                f"sequence {name!r}, frame {frame}: the trace has no time for it, since "
-                "the tracker skipped it; use the times by call, or a trace of every frame"
-            )
+            raise LaeError(f"sequence {name!r}, frame {frame}: {absent}")
         return ns
 
     return look_up

@@ -19,10 +19,10 @@ from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_score
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scored, Scorer
 from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
-from lae_sim.replay.run import Run
+from lae_sim.replay.run import Run, RunBatch, distinct, grouped
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes, Metadata
-from lae_sim.trace.recording import BESIDE, Recording, batched
+from lae_sim.trace.recording import Recording
 
 Record = TypeVar("Record", "Staleness", "Curves")
 
@@ -41,6 +41,7 @@ class ReplayStatistics:
 
     Attributes:
         sequences: names, S of them.
+        repetition: see :class:`lae_sim.replay.run.RunBatch`, int64 [S].
         frames: world frames of each, int64 [S].
         truthless: world frames of each that have no ground truth, int64 [S].
         absent: world frames of each whose target is said to be absent though they have a truth,
@@ -60,6 +61,7 @@ class ReplayStatistics:
     """
 
     sequences: tuple[str, ...]
+    repetition: Ints
     frames: Ints
     truthless: Ints
     absent: Ints
@@ -302,11 +304,12 @@ def evaluate_groups(
         observers,
         observed,
     )
-    offline: dict[Recording, _Offline] = {}
-    for group in batched(runs, frames, BESIDE):
-        offline = _offline([run.recording for run in group], convention, offline)
-        yield scoring.of(group, [offline[run.recording] for run in group])
-    if not offline:
+    known: _Known | None = None
+    for group in grouped(runs, frames):
+        if known is None or not known.places.keys() >= set(group.recordings):
+            known = _Known.of(group.distinct[0], convention, known)
+        yield scoring.of(group, known)
+    if known is None:
         raise LaeError("there is nothing to evaluate: no sequences")
 
 
@@ -329,26 +332,57 @@ class _Offline:
     precision: Floats
 
 
-def _offline(
-    recordings: Iterable[Recording], convention: Convention, known: Mapping[Recording, _Offline]
-) -> dict[Recording, _Offline]:
-    """Those of some recordings; those of the group before may be the same, replayed again."""
-    scored = {recording: known.get(recording) for recording in recordings}
-    new = [recording for recording, value in scored.items() if value is None]
-    if new:
-        offline = Scorer(new, convention).offline()
-        scores = np.stack([offline.scores[metric][:, 0] for metric in METRICS], axis=1).tolist()
-        for r, recording in enumerate(new):
-            scored[recording] = _Offline(
-                truthless=int(np.isnan(recording.truth[:, 0]).sum()),
-                absent=_absent(recording),
-                scored=is_scored(recording.truth),
-                missing=int(np.isnan(recording.boxes[:, 0]).sum()),
-                scores=scores[r],
-                success=offline.success[r],
-                precision=offline.precision[r],
-            )
-    return {recording: value for recording, value in scored.items() if value is not None}
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """Recordings that are replayed, perhaps again and again, and what is scored of them alone.
+
+    Attributes:
+        places: of the recordings, in order.
+        offline: of each.
+        scorer: scores answers for them.
+    """
+
+    places: Mapping[Recording, int]
+    offline: Sequence[_Offline]
+    scorer: Scorer
+
+    @classmethod
+    def of(
+        cls, recordings: Sequence[Recording], convention: Convention, known: _Known | None = None
+    ) -> _Known:
+        """Of distinct recordings, some of which may be known."""
+        before = {} if known is None else dict(zip(known.places, known.offline))
+        new = [recording for recording in recordings if recording not in before]
+        scored = before | dict(zip(new, _offline(new, convention)))
+        return cls(
+            {recording: k for k, recording in enumerate(recordings)},
+            [scored[recording] for recording in recordings],
+            Scorer(recordings, convention),
+        )
+
+    def which(self, runs: RunBatch) -> Ints:
+        """The place of each run's recording, int64 [S]."""
+        return np.array([self.places[recording] for recording in runs.recordings])
+
+
+def _offline(recordings: Sequence[Recording], convention: Convention) -> list[_Offline]:
+    """What is scored of recordings alone."""
+    if not recordings:  # all are known
+        return []
+    offline = Scorer(recordings, convention).offline()
+    scores = np.stack([offline.scores[metric][:, 0] for metric in METRICS], axis=1).tolist()
+    return [
+        _Offline(
+            truthless=int(np.isnan(recording.truth[:, 0]).sum()),
+            absent=_absent(recording),
+            scored=is_scored(recording.truth),
+            missing=int(np.isnan(recording.boxes[:, 0]).sum()),
+            scores=scores[r],
+            success=offline.success[r],
+            precision=offline.precision[r],
+        )
+        for r, recording in enumerate(recordings)
+    ]
 
 
 def _absent(recording: Recording) -> int:
@@ -371,13 +405,14 @@ class _Scoring:
     observers: Sequence[Observer]
     observed: Collection[tuple[str, Fraction]]
 
-    def of(self, runs: Sequence[Run], offline: Sequence[_Offline]) -> Evaluation:
-        """Score some runs at once."""
-        schedules = [run.schedule for run in runs]
+    def of(self, runs: RunBatch, known: _Known) -> Evaluation:
+        """Score some runs of known recordings at once."""
+        which = known.which(runs)
+        offline = known.offline
         costs = {self.costs.get(name, 0) for name in self.forecasters}
-        pairings = {cost: pair(schedules, self.sigmas, cost) for cost in sorted({0, *costs})}
-        kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs]
-        scored = self._scored(runs, pairings, kept)
+        pairings = {cost: pair(runs.schedules, self.sigmas, cost) for cost in sorted({0, *costs})}
+        kept: list[dict[tuple[str, Fraction], Answers]] = [{} for _ in runs.recordings]
+        scored = self._scored(runs, pairings, known, kept)
         scores = {m: np.stack([each.scores[m] for each in scored]) for m in METRICS}
         failure = np.stack([each.failure for each in scored])
         of_sequence = np.broadcast_to(np.arange(len(runs))[:, None], failure.shape)
@@ -387,7 +422,7 @@ class _Scoring:
             for observer in self.observers:
                 observer(one)
         return Evaluation(
-            replay=_replay_statistics(runs, offline, pairings[0]),
+            replay=_replay_statistics(runs, offline, which),
             staleness=Staleness.of(pairings[0]),
             scores=scores,
             failure=failure,
@@ -396,50 +431,49 @@ class _Scoring:
                 np.stack([each.success for each in scored]),
                 np.stack([each.precision for each in scored]),
             ),
-            offline=dict(zip(METRICS, np.array([each.scores for each in offline]).T)),
+            offline=dict(zip(METRICS, np.array([each.scores for each in offline])[which].T)),
             offline_curves=Curves(
-                np.stack([each.success for each in offline]),
-                np.stack([each.precision for each in offline]),
+                np.stack([each.success for each in offline])[which],
+                np.stack([each.precision for each in offline])[which],
             ),
-            modelled=self._modelled(runs, scores),
+            modelled=self._modelled(runs, known, scores),
         )
 
     def _scored(
         self,
-        runs: Sequence[Run],
+        runs: RunBatch,
         pairings: Mapping[int, Pairing],
+        known: _Known,
         kept: Sequence[dict[tuple[str, Fraction], Answers]],
     ) -> list[Scored]:
         """The scores of each forecaster."""
-        scorer = Scorer([run.recording for run in runs], self.convention)
-        scored = []
+        which, scored = known.which(runs), []
         for name, factory in self.forecasters.items():
             pairing = pairings[self.costs.get(name, 0)]
             parts = _answers(runs, self.metadata, pairing, name, factory)
             parts = self._observed(parts, pairing, name, kept)
-            scored.append(scorer.of(parts, len(self.sigmas), self.curves_at))
+            scored.append(known.scorer.of(which, parts, len(self.sigmas), self.curves_at))
         return scored
 
-    def _modelled(self, runs: Sequence[Run], recorded: Mapping[str, Floats]) -> ModelledScores:
+    def _modelled(
+        self, runs: RunBatch, known: _Known, recorded: Mapping[str, Floats]
+    ) -> ModelledScores:
         """The scores under the search model; its outcomes are scored as runs are."""
-        scores: list[dict[str, Floats]] = []
+        scores: list[dict[str, Floats]] = [{} for _ in runs.modelled]
         others = []
-        for s, run in enumerate(runs):
-            boxes = () if run.modelled is None else run.modelled.boxes
-            scores.append(
-                {m: np.stack([recorded[m][:, s]] * len(boxes), 1) for m in MODELLED}
-                if boxes
-                else {}
-            )
+        for s, outcomes in enumerate(runs.modelled):
+            if outcomes is None:
+                continue
+            run, boxes = runs[s], outcomes.boxes
+            scores[s] = {m: np.stack([recorded[m][:, s]] * len(boxes), 1) for m in MODELLED}
             for r, each in enumerate(boxes):
                 if not np.array_equal(each, run.boxes):
                     others.append((s, r, replace(run, boxes=each)))
         costs = {self.costs.get(name, 0) for name in self.forecasters}
         unobserved, places = replace(self, observed=()), iter(others)
-        for group in batched([run for *_, run in others], GROUP_FRAMES, BESIDE):
-            schedules = [run.schedule for run in group]
-            pairings = {cost: pair(schedules, self.sigmas, cost) for cost in costs}
-            scored = unobserved._scored(group, pairings, [])
+        for group in grouped([run for *_, run in others], GROUP_FRAMES):
+            pairings = {cost: pair(group.schedules, self.sigmas, cost) for cost in costs}
+            scored = unobserved._scored(group, pairings, known, [])
             for i, (s, r, _) in enumerate(islice(places, len(group))):
                 for metric in MODELLED:
                     scores[s][metric][:, r] = [each.scores[metric][i] for each in scored]
@@ -462,44 +496,47 @@ class _Scoring:
 
 
 def _replay_statistics(
-    runs: Sequence[Run], offline: Sequence[_Offline], pairing: Pairing
+    runs: RunBatch, offline: Sequence[_Offline], which: Ints
 ) -> ReplayStatistics:
-    elapsed = [run.schedule.elapsed_ns for run in runs]
+    """Those of some runs, with what is scored of recordings alone, and which of them each is of."""
+    schedules = runs.schedules
+    firsts = schedules.offsets[:-1]
+    elapsed = (schedules.ready - schedules.start) // schedules.clocks[0].ticks_per_ns
+    init_ns = elapsed[firsts]
+    rates = np.full(len(elapsed), np.inf)
+    np.divide(1e9, elapsed, out=rates, where=elapsed > 0)
+    # zeros in place of initialisations: what is summed up are the other calls, in their order
+    elapsed[firsts], rates[firsts] = 0, 0.0
     return ReplayStatistics(
-        sequences=tuple(run.recording.name for run in runs),
-        frames=pairing.lengths,
-        truthless=np.array([each.truthless for each in offline], np.int64),
-        absent=np.array([each.absent for each in offline], np.int64),
-        scored=np.array([each.scored for each in offline]),
-        missing=np.array([each.missing for each in offline], np.int64),
-        processed=np.diff(pairing.offsets),
-        scores_latency=np.array([run.schedule.scores_latency for run in runs]),
-        departures=np.array([run.departures for run in runs], np.int64),
-        disagreement=np.array([run.disagreement for run in runs]),
-        init_ns=np.array([each[0] for each in elapsed], np.int64),
+        sequences=tuple(recording.name for recording in runs.recordings),
+        repetition=runs.repetition,
+        frames=schedules.lengths,
+        truthless=np.array([each.truthless for each in offline], np.int64)[which],
+        absent=np.array([each.absent for each in offline], np.int64)[which],
+        scored=np.array([each.scored for each in offline])[which],
+        missing=np.array([each.missing for each in offline], np.int64)[which],
+        processed=np.diff(schedules.offsets),
+        scores_latency=schedules.scores_latency,
+        departures=runs.departures,
+        disagreement=runs.disagreement,
+        init_ns=init_ns,
         left_search=_left_search(runs),
-        calls_ns=np.array([each[1:].sum() for each in elapsed], np.int64),
-        calls_hz=np.array([_rates(each[1:]).sum() for each in elapsed]),
+        calls_ns=np.add.reduceat(elapsed, firsts),
+        calls_hz=np.add.reduceat(rates, firsts),
     )
 
 
-def _left_search(runs: Sequence[Run]) -> Bools:
+def _left_search(runs: RunBatch) -> Bools:
     """Whether the target leaves the search region during each initialisation, bool [S]."""
     # of a run that processes nothing more, and of one that skips nothing, frame 0: no distance
-    resumed = [int(run.schedule.frames[1:2].sum()) for run in runs]
-    truth = [
-        run.recording.truth[[0, frame if frame > 1 else 0]] for run, frame in zip(runs, resumed)
-    ]
-    initial, then = np.array(truth).transpose(1, 0, 2)
+    offsets, frames = runs.schedules.offsets, runs.schedules.frames
+    resumed = np.where(np.diff(offsets) > 1, frames.take(offsets[:-1] + 1, mode="clip"), 0)
+    resumed[resumed == 1] = 0
+    truths = [recording.truth for recording in runs.recordings]
+    initial = np.array([truth[0] for truth in truths])
+    then = np.array([truth[frame] for truth, frame in zip(truths, resumed.tolist())])
     left: Bools = search_distance(initial, then) >= 1
     return left
-
-
-def _rates(elapsed_ns: Ints) -> Floats:
-    """Frames per second of each call, infinite for one that took no time."""
-    rates = np.full(len(elapsed_ns), np.inf)
-    np.divide(1e9, elapsed_ns, out=rates, where=elapsed_ns > 0)
-    return rates
 
 
 def answers(
@@ -512,7 +549,7 @@ def answers(
 ) -> Answers:
     """What a forecaster answers for every world frame of one run."""
     pairing = pair([run.schedule], [sigma], cost_ns)
-    (part,) = _answers([run], metadata, pairing, name, factory)
+    (part,) = _answers(RunBatch.of([run]), metadata, pairing, name, factory)
     ((_, only),) = _answers_at(0, pairing, part)
     return only
 
@@ -532,10 +569,10 @@ def _answers_at(m: int, pairing: Pairing, part: PairedBoxes) -> Iterator[tuple[i
 
 
 def lanes_of(
-    runs: Sequence[Run],
+    runs: RunBatch,
     pairing: Pairing,
     fed: Histories,
-    image_sizes: Sequence[ImageSizes | None],
+    metadata: Metadata | None,
 ) -> Lanes:
     """What forecasters are fed in some histories of some runs.
 
@@ -543,16 +580,20 @@ def lanes_of(
         runs: those that were paired.
         pairing: of their schedules.
         fed: histories of the pairing.
-        image_sizes: of each run; None = unknown.
+        metadata: of the trace, for the sizes of images; None = unknown.
     """
-    boxes = np.concatenate([run.boxes for run in runs])
     numbers = pairing.frames.take(fed.output)
     frames = pairing.frame_times(np.repeat(fed.sequence, np.diff(fed.offsets)), numbers)
-    fed_boxes = boxes.take(fed.output, axis=0)
-    first = [(np.inf, np.inf) if sizes is None else sizes.at(0) for sizes in image_sizes]
+    fed_boxes = runs.boxes.take(fed.output, axis=0)
+    recordings, which = runs.distinct
+    first = np.full((len(recordings), 2), np.inf)
     resized: dict[int, ImageSizes] = {}
-    for s, sizes in enumerate(image_sizes):
-        if sizes is not None and sizes.change:
+    for k, recording in enumerate(recordings if metadata is not None else ()):
+        sizes = metadata.image_sizes(recording.name)
+        if sizes is None:
+            continue
+        first[k] = sizes.at(0)
+        for s in np.flatnonzero(which == k) if sizes.change else ():
             starts = pairing.frame_times(np.full(len(sizes.starts), s), np.array(sizes.starts))
             timed = ImageSizes(tuple(starts.tolist()), sizes.sizes)
             resized |= {int(lane): timed for lane in np.flatnonzero(fed.sequence == s)}
@@ -560,14 +601,14 @@ def lanes_of(
         fed.offsets,
         frames,
         fed_boxes,
-        np.array(first, np.float64)[fed.sequence],
+        first[which[fed.sequence]],
         None if frames is numbers else numbers,
         resized,
     )
 
 
 def _answers(
-    runs: Sequence[Run],
+    runs: RunBatch,
     metadata: Metadata,
     pairing: Pairing,
     name: str,
@@ -582,29 +623,29 @@ def _answers(
         raise LaeError(
             f"{name} sees frames when they arrive: not before, as sigma < 0 would have it"
         )
-    image_sizes = [metadata.image_sizes(run.recording.name) for run in runs]
+    recordings, which = runs.distinct
     with explained(name):
-        factories = (
-            [factory.for_sequence(run.recording) for run in runs]
+        own = (
+            [factory.for_sequence(recording) for recording in recordings]
             if isinstance(factory, SequenceFactory)
-            else [factory] * len(runs)
+            else [factory] * len(recordings)
         )
+        factories, of_recording = distinct(own)
+    factory_of = of_recording[which]
     for fed in histories(pairing, memoryless=defines(factory, "memoryless")).parts(_PART):
         paired = pairs(pairing, fed)
-        lanes = lanes_of(runs, pairing, fed, image_sizes)
+        lanes = lanes_of(runs, pairing, fed, metadata)
         frame: Ints | Floats = paired.frame
         number: Ints | None = None
         if lanes.numbers is not None:
             sequence = fed.sequence.take(lanes.lane(paired.item))
             frame, number = pairing.frame_times(sequence, paired.frame), paired.frame
-        distinct = {id(one): one for one in factories}.values()
-        if len(distinct) == 1:
+        if len(factories) == 1:
             yield fed, paired, forecast(factories[0], lanes, paired.item, frame, name, number)
             continue
         answered = np.empty((len(paired.item), 4))
-        for one in distinct:  # at once where several sequences share one
-            chosen = np.array([other is one for other in factories])[fed.sequence]
-            part, asked, item = lanes.chosen(chosen, paired.item)
+        for k, one in enumerate(factories):  # at once where several sequences share one
+            part, asked, item = lanes.chosen(factory_of[fed.sequence] == k, paired.item)
             some = None if number is None else number[asked]
             answered[asked] = forecast(one, part, item, frame[asked], name, some)
         yield fed, paired, answered

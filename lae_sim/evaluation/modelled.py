@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats
-from lae_sim.replay.run import Run
+from lae_sim.replay.run import RunBatch
 from lae_sim.replay.search import Outcomes
 
 MODELLED = ("auc", "dp20")
@@ -93,7 +93,7 @@ class ModelledScores:
 
 
 def modelled_scores(
-    runs: Sequence[Run],
+    runs: RunBatch,
     recorded: Mapping[str, Floats],
     outcomes: Sequence[Mapping[str, Floats]],
 ) -> ModelledScores:
@@ -105,8 +105,8 @@ def modelled_scores(
         outcomes: for each run, per metric, scores of its outcomes, float64 [F, R, M]; empty where
             it has none.
     """
-    known = {run.modelled.known for run in runs if run.modelled is not None}
-    lost, applies = np.zeros(len(runs)), np.array([run.modelled is not None for run in runs])
+    known = {each.known for each in runs.modelled if each is not None}
+    lost, applies = np.zeros(len(runs)), np.array([each is not None for each in runs.modelled])
     if not known:
         same = {m: recorded[m] for m in MODELLED}
         sums = {m: np.stack([np.nansum(same[m], 1), (~np.isnan(same[m])).sum(1)]) for m in same}
@@ -116,11 +116,10 @@ def modelled_scores(
     forecasters, _, sigmas = recorded[MODELLED[0]].shape
     (is_known,) = known
     joint = _DRAWS if is_known else 3
-    forecast = any(run.modelled is not None and run.modelled.forecast for run in runs)
+    forecast = any(each is not None and each.forecast for each in runs.modelled)
     rest = UNEXPLAINED_FORECAST if forecast else UNEXPLAINED
     draws = {m: np.zeros((2, forecasters, joint, sigmas)) for m in MODELLED}
-    for s, (run, scores) in enumerate(zip(runs, outcomes)):
-        modelled = run.modelled
+    for s, (modelled, scores) in enumerate(zip(runs.modelled, outcomes)):
         if modelled is None:
             for metric in MODELLED:
                 _add(draws[metric], recorded[metric][:, s, None])
@@ -134,7 +133,7 @@ def modelled_scores(
                 ends = _quantiles(values, modelled.weights[0])
                 low[metric][:, s] = np.maximum(ends[0] - rest[metric], 0.0)
                 high[metric][:, s] = np.minimum(ends[1] + rest[metric], 1.0)
-                _add(draws[metric], values[:, _drawn(run.recording.name, modelled, joint)])
+                _add(draws[metric], values[:, _drawn(runs.recordings[s].name, modelled, joint)])
             else:
                 mean[metric][:, s] = means[:, 1]
                 low[metric][:, s], high[metric][:, s] = means.min(axis=1), means.max(axis=1)

@@ -22,7 +22,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Frames, Ints
 from lae_sim._compiled import compiled
 from lae_sim.engine.clock import MAX_INT64, Clock
-from lae_sim.engine.scheduler import Schedule
+from lae_sim.engine.scheduler import Schedule, Schedules
 from lae_sim.errors import LaeError
 
 MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
@@ -199,12 +199,17 @@ class Pairing:
             sequence: by its place, int64 [P].
             frame: world frame, int64 [P]; the one after the last is the end of the stream.
         """
-        if all(clock.is_even for clock in self.clocks):
+        if self.is_even:
             return frame
         table = np.concatenate([self._instants(s) for s in range(len(self.clocks))])
         starts = np.cumsum(self.lengths + 1) - self.lengths - 1
         times: Floats = table.take(starts.take(sequence) + frame) / self.clocks[0].frame_ticks
         return times
+
+    @cached_property
+    def is_even(self) -> bool:
+        """Whether frames of all sequences arrive evenly."""
+        return all(clock.is_even for clock in set(self.clocks))
 
     def _instants(self, sequence: int) -> Ints:
         """The ticks at which the frames of a sequence arrive, and its end, int64 [T + 1]."""
@@ -213,10 +218,14 @@ class Pairing:
 
     def _uneven(self) -> Iterator[tuple[int, Clock]]:
         """The sequences whose frames arrive at times of their own, by their places."""
+        if self.is_even:
+            return iter(())
         return ((s, clock) for s, clock in enumerate(self.clocks) if not clock.is_even)
 
 
-def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int = 0) -> Pairing:
+def pair(
+    schedules: Sequence[Schedule] | Schedules, sigmas: Sequence[Fraction], cost_ns: int = 0
+) -> Pairing:
     """Pair the outputs of some sequences with their queries.
 
     Where the schedules' policy never scores latency, each output counts from its own frame's
@@ -235,20 +244,21 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
         raise LaeError("permitted latencies must be exact: Fraction(1, 2), not 0.5")
     if not sigmas or list(sigmas) != sorted(set(sigmas)):
         raise LaeError("permitted latencies must be ascending, each of them once")
-    clocks = tuple(schedule.clock for schedule in schedules)
-    if len({(clock.ticks_per_ns, clock.frame_ticks) for clock in clocks}) != 1:
+    if not isinstance(schedules, Schedules):
+        schedules = Schedules.of(schedules)
+    clocks, lengths, offsets = schedules.clocks, schedules.lengths, schedules.offsets
+    if len({(clock.ticks_per_ns, clock.frame_ticks) for clock in set(clocks)}) != 1:
         raise LaeError("sequences of different frame rates cannot be paired together")
-    scored = {schedule.scores_latency for schedule in schedules}
-    if len(scored) != 1:
+    at_once = not schedules.scores_latency[0]
+    if (schedules.scores_latency == at_once).any():
         raise LaeError("sequences cannot be paired together if only some of them score latency")
     scale = lcm(*(sigma.denominator for sigma in sigmas))
     numerators = [int(sigma * scale) for sigma in sigmas]
     interval = clocks[0].frame_ticks
-    lengths = np.array([schedule.length for schedule in schedules], np.int64)
     if cost_ns < 0:
         raise LaeError(f"forecasting cannot cost {cost_ns} ns, less than nothing")
     cost = cost_ns * clocks[0].ticks_per_ns
-    last_ready = max(int(schedule.ready[-1]) for schedule in schedules) + cost
+    last_ready = int(schedules.ready[offsets[1:] - 1].max()) + cost
     if last_ready > MAX_INT64:
         raise LaeError(f"forecasting cannot cost {cost_ns:g} ns: the clock ends before")
     largest = max(last_ready // interval, int(lengths.max())) * scale
@@ -258,11 +268,10 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
             f"the permitted latencies {', '.join(map(str, sigmas[:3]))}... are too fine or too "
             "large for exact 64-bit arithmetic: use fewer digits"
         )
-    counts = [len(schedule.frames) for schedule in schedules]
-    offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    frames = np.concatenate([schedule.frames for schedule in schedules])
-    at_once = scored == {False}
-    if not at_once and any((s.start[1:] < s.ready[:-1]).any() for s in schedules):
+    frames = schedules.frames
+    overlaps = schedules.start[1:] < schedules.ready[:-1]
+    overlaps[offsets[1:-1] - 1] = False
+    if not at_once and overlaps.any():
         raise LaeError(
             "calls overlap, as under the rule of VOT, which never scores latency: such a policy "
             "says so by an attribute, scores_latency = False"
@@ -270,16 +279,16 @@ def pair(schedules: Sequence[Schedule], sigmas: Sequence[Fraction], cost_ns: int
     m = np.array(numerators, np.int64)
     steps: Ints | None = None
     next_steps: Ints | None = None
-    if all(clock.is_even for clock in clocks):
+    if all(clock.is_even for clock in set(clocks)):
         if at_once:
             steps = frames * scale
         else:
-            frame, rest = np.divmod(np.concatenate([s.ready for s in schedules]) + cost, interval)
+            frame, rest = np.divmod(schedules.ready + cost, interval)
             steps = frame * scale - (-rest * scale // interval)
         steps[offsets[:-1]] = -_NEVER
         next_steps = np.append(steps[1:], _NEVER)
         next_steps[offsets[1:] - 1] = _NEVER
-        first = _first_visible(steps, m, scale, np.repeat(lengths, counts))
+        first = _first_visible(steps, m, scale, np.repeat(lengths, np.diff(offsets)))
     else:
         permitted = [each * interval // scale for each in numerators]
         if last_ready + max(map(abs, permitted)) > MAX_INT64:
@@ -350,6 +359,9 @@ class Histories:
 
         Sequences of similar size go together, and ascend in each part.
         """
+        if self.offsets[-1] <= items:
+            yield self
+            return
         sequences, lanes = np.unique(self.sequence, return_counts=True)
         lane_sizes = np.diff(self.offsets)
         sizes = np.bincount(self.sequence, lane_sizes)[sequences].astype(np.int64)
@@ -384,15 +396,18 @@ def histories(pairing: Pairing, memoryless: bool = False) -> Histories:
     look at the latest output alone, one history of all outputs serves every sigma.
     """
     count = len(pairing.sigmas)
-    if not memoryless and compiled():
+    if memoryless:
+        every = np.arange(len(pairing.lengths))
+        whole = np.full(len(every), count)
+        output = np.arange(len(pairing.frames))
+        return Histories(every, np.zeros_like(every), whole, pairing.offsets, output)
+    if compiled():
         return _histories_by_kernel(pairing)
     used = pairing.end > pairing.first
     used[pairing.offsets[:-1]] = True  # every forecaster starts from the initial box
     begins = np.zeros((len(pairing.lengths), count), np.bool_)
     begins[:, 0] = True
-    if memoryless:
-        used[:] = True
-    elif count > 1:
+    if count > 1:
         begins[:, 1:] = np.logical_or.reduceat(used[:, 1:] != used[:, :-1], pairing.offsets[:-1])
     sequence, sigma_from, sigma_to = _shared_ranges(begins)
     sizes = np.diff(pairing.offsets)[sequence]

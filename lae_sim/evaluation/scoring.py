@@ -46,11 +46,10 @@ class Scorer:
     """Scores answers for some recordings against their truth."""
 
     def __init__(self, recordings: Sequence[Recording], convention: Convention) -> None:
-        self._convention = convention
+        self._recordings, self._convention = recordings, convention
         self._lengths = np.array([len(recording) for recording in recordings], np.int64)
         self._bases = np.cumsum(self._lengths) - self._lengths
         self._truth = _columns([convention.truth_of(r.truth, r.visible) for r in recordings])
-        self._boxes = _columns([recording.boxes for recording in recordings])
         counted = self._lengths
         if convention.leaves_out and not convention.of_all:
             valid = convention.valid_success(self._truth.T)
@@ -59,10 +58,22 @@ class Scorer:
         self._counted = np.where(self._is_scored & (counted > 0), counted, np.nan)
 
     def of(
-        self, parts: Iterable[tuple[Histories, Pairs, Floats]], count: int, curves_at: int = 0
+        self,
+        which: Ints,
+        parts: Iterable[tuple[Histories, Pairs, Floats]],
+        count: int,
+        curves_at: int = 0,
     ) -> Scored:
-        """Score paired answers for so many sigmas, with the curves at one of them."""
+        """Score paired answers for so many sigmas, with the curves at one of them.
+
+        Args:
+            which: the recording of each sequence, by its place, int64 [S].
+            parts: histories, their pairs and the boxes of those.
+            count: number of sigmas M.
+            curves_at: index of one.
+        """
         return self._scored(
+            which,
             (
                 (np.repeat(fed.sequence, np.diff(fed.offsets)).take(paired.item), paired, boxes)
                 for fed, paired, boxes in parts
@@ -72,27 +83,33 @@ class Scorer:
         )
 
     def offline(self) -> Scored:
-        """Score every frame's own box; NaN for sequences that lack some."""
-        sequence = np.repeat(np.arange(len(self._bases)), self._lengths)
+        """Score every frame's own box of each recording; NaN for those that lack some."""
+        boxes = np.concatenate([recording.boxes for recording in self._recordings])
+        each = np.arange(len(self._bases))
+        sequence = np.repeat(each, self._lengths)
         frame = np.arange(len(sequence)) - self._bases[sequence]
         none = np.zeros_like(frame)
-        scored = self._scored([(sequence, Pairs(frame, frame, none, none + 1), self._boxes.T)], 1)
-        missing = np.add.reduceat(np.isnan(self._boxes[0]).astype(np.int64), self._bases) > 0
+        scored = self._scored(each, [(sequence, Pairs(frame, frame, none, none + 1), boxes)], 1)
+        missing = np.add.reduceat(np.isnan(boxes[:, 0]).astype(np.int64), self._bases) > 0
         for values in (*scored.scores.values(), scored.success, scored.precision):
             values[missing] = np.nan
         return scored
 
     def _scored(
-        self, parts: Iterable[tuple[Ints, Pairs, Floats]], count: int, curves_at: int = 0
+        self,
+        which: Ints,
+        parts: Iterable[tuple[Ints, Pairs, Floats]],
+        count: int,
+        curves_at: int = 0,
     ) -> Scored:
         """Score answers, each part with the sequence of each pair, int64 [P]."""
-        tally = _Tally(self._lengths, count, curves_at, self._convention.thresholds)
+        tally = _Tally(self._lengths[which], count, curves_at, self._convention.thresholds)
         counted = self._by_kernel if compiled() else self._by_numpy
         for part in parts:
-            counted(tally, *_kept(*part, self._convention))
-        tally.failure[~self._is_scored] = -1
+            counted(tally, self._bases[which], *_kept(*part, self._convention))
+        tally.failure[~self._is_scored[which]] = -1
         thresholds = {"auc": self._convention.thresholds, "norm_auc": len(NORM_THRESHOLDS)}
-        every = self._counted[:, None]
+        every = self._counted[which, None]
         sums = tally.sums
         scores = {m: sums[m] / (every * thresholds.get(m, 1)) for m in METRICS}
         success, precision = tally.success / every, tally.precision / every
@@ -104,26 +121,30 @@ class Scorer:
             precision[np.isnan(scores["dp20"][:, curves_at])] = np.nan
         return Scored(scores, tally.failure, success, precision)
 
-    def _by_numpy(self, tally: _Tally, sequence: Ints, paired: Pairs, boxes: Floats) -> None:
+    def _by_numpy(
+        self, tally: _Tally, bases: Ints, sequence: Ints, paired: Pairs, boxes: Floats
+    ) -> None:
         """Count pairs, so many at once that what is made of them stays in the cache."""
         for begin in range(0, len(boxes), _CHUNK):
             now = slice(begin, begin + _CHUNK)
             some = paired.some(now)
-            truth = self._truth.take(self._bases[sequence[now]] + some.frame, axis=1).T
+            truth = self._truth.take(bases[sequence[now]] + some.frame, axis=1).T
             tally.add(
                 sequence[now],
                 some,
                 frame_counts(truth, boxes[now], some.frame, self._convention),
             )
 
-    def _by_kernel(self, tally: _Tally, sequence: Ints, paired: Pairs, boxes: Floats) -> None:
+    def _by_kernel(
+        self, tally: _Tally, bases: Ints, sequence: Ints, paired: Pairs, boxes: Floats
+    ) -> None:
         """Count pairs one after another; equal bit for bit."""
         from lae_sim.evaluation.kernels import count_pairs
 
         convention = self._convention
         steps, success, precision = tally.empty()
         count_pairs(
-            self._bases,
+            bases,
             self._truth,
             sequence,
             paired.frame,

@@ -23,7 +23,7 @@ from lae_sim.forecast.base import (
     factory_for,
     notes_of,
 )
-from lae_sim.replay.run import Run
+from lae_sim.replay.run import Run, RunBatch
 from lae_sim.replay.world import World
 from lae_sim.trace.file import Trace
 
@@ -52,10 +52,11 @@ class Examples:
     @classmethod
     def of(cls, runs: Sequence[Run]) -> Examples:
         """The examples of some runs of one trace."""
-        pairing = pair([run.schedule for run in runs], [Fraction(0)])
+        batch = RunBatch.of(runs)
+        pairing = pair(batch.schedules, [Fraction(0)])
         fed = histories(pairing)
         queries = pairs(pairing, fed)
-        lanes = lanes_of(runs, pairing, fed, [None] * len(runs))
+        lanes = lanes_of(batch, pairing, fed, None)
         ends = np.cumsum(pairing.lengths)
         sequence = fed.sequence.take(lanes.lane(queries.item))
         row = (ends - pairing.lengths)[sequence] + queries.frame
@@ -139,6 +140,20 @@ class Trainer(Protocol):
         """The factory that these examples lead to."""
 
 
+@runtime_checkable
+class FoldTrainer(Protocol):
+    """A trainer that is faster for all folds at once, since they share most of their examples."""
+
+    def fit_folds(
+        self,
+        examples: Examples,
+        held_out: Sequence[Collection[str]],
+        seed: int,
+        progress: Callable[[], object],
+    ) -> list[AnyFactory]:
+        """What :func:`fit_folds` returns, equal to one ``fit`` for each fold."""
+
+
 @dataclass(frozen=True)
 class CrossFitted:
     """A forecaster trained once per fold, which answers for the sequences that it has not seen.
@@ -185,12 +200,33 @@ def cross_fitted(
         seed: of the training.
         progress: called before each fold.
     """
+    held_out: list[set[str]] = [set() for _ in range(max(folds.values()) + 1)]
+    for name, fold in folds.items():
+        held_out[fold].add(name)
+    return CrossFitted(folds, tuple(fit_folds(trainer, examples, held_out, seed, progress)))
+
+
+def fit_folds(
+    trainer: Trainer,
+    examples: Examples,
+    held_out: Sequence[Collection[str]],
+    seed: int,
+    progress: Callable[[], object] = lambda: None,
+) -> list[AnyFactory]:
+    """The factory that a trainer makes without some sequences, for each of several such sets.
+
+    Args:
+        trainer, examples, seed: see :func:`cross_fitted`.
+        held_out: the sequences to leave out, of each fold.
+        progress: called before each fold.
+    """
+    if isinstance(trainer, FoldTrainer):
+        return trainer.fit_folds(examples, held_out, seed, progress)
     factories = []
-    for fold in range(max(folds.values()) + 1):
+    for names in held_out:
         progress()
-        held_out = {name for name, assigned in folds.items() if assigned == fold}
-        factories.append(trainer.fit(examples.without(held_out), seed))
-    return CrossFitted(folds, tuple(factories))
+        factories.append(trainer.fit(examples.without(names), seed))
+    return factories
 
 
 def assign_folds(sequences: Iterable[str], folds: int = 5, seed: int = 0) -> dict[str, int]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -13,8 +14,8 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import iou
 from lae_sim.errors import LaeError, install
-from lae_sim.forecast.base import AnyFactory, ForecasterFactory
-from lae_sim.forecast.kalman import PAPER
+from lae_sim.forecast.base import AnyFactory
+from lae_sim.forecast.kalman import PAPER, TunedKalman
 from lae_sim.forecast.learned import (
     CORRECTION,
     HORIZONS,
@@ -30,7 +31,7 @@ from lae_sim.forecast.learned import (
     rows_of,
 )
 from lae_sim.forecast.network import ONE, Network
-from lae_sim.learning.folds import Examples, Trainer
+from lae_sim.learning.folds import Examples, Trainer, fit_folds
 
 
 @dataclass(frozen=True)
@@ -262,25 +263,56 @@ class KalmanTrainer:
     decay: tuple[float, ...] = (0.8, 0.9, 0.95, 0.98, 0.99, 1.0)
     state: tuple[str, ...] = ("corner", "centre")
 
-    def fit(self, examples: Examples, seed: int = 0) -> ForecasterFactory:
+    def fit(self, examples: Examples, seed: int = 0) -> TunedKalman:
         """The filter that suits all examples best; the seed plays no part.
 
         Raises:
             LaeError: if there is no truth to learn from.
         """
-        valid = np.flatnonzero(_sized(examples.truth))
-        if not len(valid):
-            raise LaeError("there is nothing to learn from: no frame has a truth")
-        item, frame, truth = examples.item[valid], examples.frame[valid], examples.truth[valid]
-        weight = examples.weight[valid]
-        tried: dict[Any, float] = {}
+        (best,) = self.fit_folds(examples, [()], seed)
+        return best
 
-        def score(settings: Any) -> float:
+    def fit_folds(
+        self,
+        examples: Examples,
+        held_out: Sequence[Collection[str]],
+        seed: int,
+        progress: Callable[[], object] = lambda: None,
+    ) -> list[TunedKalman]:
+        """The filter that suits best all sequences but some, for each of several such sets.
+
+        Sequences are filtered once with each value that some fold tries: what a filter makes of one
+        does not depend on the others.
+
+        Raises:
+            LaeError: if there is no truth to learn from.
+        """
+        valid = np.flatnonzero(_sized(examples.truth))
+        item, frame, truth = examples.item[valid], examples.frame[valid], examples.truth[valid]
+        weight, sequence = examples.weight[valid], examples.lanes.lane(item)
+        learnt = [
+            np.array([name not in names for name in examples.sequences])[sequence]
+            for names in held_out
+        ]
+        tried: dict[TunedKalman, list[float]] = {}
+
+        def score(fold: int, settings: TunedKalman) -> float:
             if settings not in tried:
                 boxes = settings.forecast_lanes(examples.lanes, item, frame)
-                tried[settings] = float((iou(truth, boxes) * weight).sum())
-            return tried[settings]
+                overlap = iou(truth, boxes) * weight
+                tried[settings] = [float(overlap[those].sum()) for those in learnt]
+            return tried[settings][fold]
 
+        found = []
+        for fold, those in enumerate(learnt):
+            progress()
+            if not those.any():
+                raise LaeError("there is nothing to learn from: no frame has a truth")
+            found.append(self._best(partial(score, fold)))
+        return found
+
+    def _best(self, score: Callable[[TunedKalman], float]) -> TunedKalman:
+        """The filter of the highest score, one parameter after another."""
         best, before = PAPER, None
         while best != before:
             before = best
@@ -305,3 +337,15 @@ class WrappedTrainer:
     def fit(self, examples: Examples, seed: int) -> AnyFactory:
         """The forecaster that these examples lead to."""
         return self.wrap(self.base.fit(examples, seed))
+
+    def fit_folds(
+        self,
+        examples: Examples,
+        held_out: Sequence[Collection[str]],
+        seed: int,
+        progress: Callable[[], object],
+    ) -> list[AnyFactory]:
+        """The forecaster of each of several folds."""
+        return [
+            self.wrap(base) for base in fit_folds(self.base, examples, held_out, seed, progress)
+        ]

@@ -8,7 +8,8 @@ frame the predicted box sets the tracker's search region (Li et al., "Predictive
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from time import perf_counter_ns
@@ -107,12 +108,18 @@ def run_every_frame(
         runs.append(live.result(frames))
     whole, measured = runs[-1], np.zeros(length, np.int64)
     sizes = np.zeros((length, 2), np.int64)
+    names = {name for run in runs for name in run.recording.stages}
+    stages = {name: np.full(length, -1, np.int64) for name in names}
     for run in reversed(runs):  # of the phases that hold a frame, the first stands
         measured[run.frames], sizes[run.frames] = run.measured_ns, run.image_sizes
         for name in ("boxes", "elapsed_ns", "score"):
             getattr(whole.recording, name)[run.frames] = getattr(run.recording, name)[run.frames]
+        for name, ns in stages.items():
+            marked = run.recording.stages.get(name)
+            ns[run.frames] = -1 if marked is None else marked[run.frames]
     return replace(
         whole,
+        recording=replace(whole.recording, stages=stages),
         frames=np.arange(length),
         measured_ns=measured,
         cpu_ns=sum(run.cpu_ns for run in runs),
@@ -182,12 +189,13 @@ class Live:
         self._sizes: list[tuple[int, int]] = []
         self._answers: list[Answer] = []
         self._elapsed_ns: list[int] = []
+        self._stages: list[Mapping[str, int]] = []
 
     def __call__(self, frame: int) -> int:
         """Process a frame; the time it took, ns."""
         before = perf_counter_ns()
         image = self._sequence.read(frame)
-        decoding = perf_counter_ns() - before if self._include_decode else 0
+        decoding = perf_counter_ns() - before
         try:
             self._check(frame, image)
             answer = self._init(image) if frame == 0 else self._track(frame, image)
@@ -197,9 +205,15 @@ class Live:
         self._answers.append(answer)
         self._progress(frame - self._last)
         self._last = frame
-        elapsed_ns = self._service(frame) if self._service else answer.elapsed_ns + decoding
+        elapsed_ns, stages = answer.elapsed_ns, Counter(answer.stages)
+        if self._include_decode:
+            elapsed_ns += decoding
+            stages["decode"] += decoding
+        if self._service:  # of whose times nothing is known but the sum
+            elapsed_ns, stages = self._service(frame), Counter()
         elapsed_ns += self._forecasting_ns
         self._elapsed_ns.append(elapsed_ns)
+        self._stages.append(stages)
         return elapsed_ns
 
     def _init(self, image: Image) -> Answer:
@@ -255,6 +269,9 @@ class Live:
         boxes[frames] = held
         elapsed[frames] = self._elapsed_ns
         scores[frames] = [np.nan if a.score is None else a.score for a in self._answers]
+        stages = {name: np.full(length, -1, np.int64) for each in self._stages for name in each}
+        for name, ns in stages.items():
+            ns[frames] = [each.get(name, -1) for each in self._stages]
         return LiveRun(
             Recording.new(
                 self._sequence.name,
@@ -264,6 +281,7 @@ class Live:
                 scores,
                 self._sequence.arrival_ns,
                 self._sequence.visible,
+                stages,
             ),
             frames,
             np.array([answer.elapsed_ns for answer in self._answers], np.int64),

@@ -24,7 +24,7 @@ from lae_sim.profile.timed import TimedTracker, TrackerError
 from lae_sim.replay.latency import by_frame, initialised
 from lae_sim.trace.file import Trace, read_trace, write_trace
 from lae_sim.trace.metadata import FORMAT, ImageSizes, Metadata, version_of
-from lae_sim.trace.recording import Recording
+from lae_sim.trace.recording import Recording, stage_of
 
 READING_INTERVAL_S = 10.0
 
@@ -299,8 +299,25 @@ def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> boo
     if task.metadata.kind == "restarts":  # "a b" before "a", but "a@1+3" before "a b@1+3"
         recordings = sorted(recordings, key=lambda recording: recording.name)
     columns = frozenset(column for trace in traces for column in trace.columns)
-    write_trace(Trace(Metadata.of(document), recordings, columns=columns), task.path)
+    marked = [stage for column in columns if (stage := stage_of(column)) not in (None, "decode")]
+    whole = (_with_stages(recording, marked) for recording in recordings)
+    write_trace(Trace(Metadata.of(document), whole, columns=columns), task.path)
     return True
+
+
+def _with_stages(recording: Recording, marked: Sequence[str]) -> Recording:
+    """The recording with a time of each stage that is marked anywhere, where that is known.
+
+    A call that enters some stages says that it spent no time in the others. One that enters none,
+    as initialisations often do, says nothing.
+    """
+    if not marked:
+        return recording
+    unknown = np.full(len(recording), -1, np.int64)
+    known = {stage: recording.stages.get(stage, unknown) for stage in marked}
+    entered = np.any([ns >= 0 for ns in known.values()], 0)
+    stages = {stage: np.where(entered & (ns < 0), 0, ns) for stage, ns in known.items()}
+    return replace(recording, stages={**recording.stages, **stages})
 
 
 def summary(path: Path) -> PassSummary:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from lae_sim.datasets.frames import Image
@@ -23,12 +23,14 @@ class Answer:
         score: the tracker's confidence, or None.
         elapsed_ns: wall time of the call, ns.
         cpu_ns: CPU time of the tracker's process during the call, ns, all threads.
+        stages: what the stages took that the tracker marked, ns, by name; parts of ``elapsed_ns``.
     """
 
     box: tuple[float, float, float, float] | None
     score: float | None
     elapsed_ns: int
     cpu_ns: int
+    stages: Mapping[str, int] = field(default_factory=dict)
 
 
 class TimedTracker(Protocol):

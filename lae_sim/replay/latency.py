@@ -30,7 +30,7 @@ from lae_sim.engine.clock import MAX_INT64, duration_ns
 from lae_sim.engine.scheduler import Service
 from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError
-from lae_sim.trace.recording import Recording
+from lae_sim.trace.recording import Recording, in_order, stage_column
 
 LatencySource = Callable[[Recording], Service]
 """``source(recording)`` returns the service that times that sequence."""
@@ -46,6 +46,47 @@ def by_frame(recording: Recording) -> Times:
 def by_call(recording: Recording) -> Times:
     """The k-th call takes the k-th recorded time: warm-up stalls belong to the call."""
     return Times(recording.name, _recorded(recording), by_call=True)
+
+
+@dataclass(frozen=True)
+class StageTimes:
+    """The times recorded for some stages of the frame itself, added up.
+
+    Attributes:
+        stages: their names, each once.
+
+    Raises:
+        LaeError: if there is none, one is there twice, or is no name of a stage; for a recording,
+            if it lacks one. A frame of which it does not say all of them has no time.
+    """
+
+    stages: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        columns = [stage_column(name) for name in self.stages]
+        if not columns or len(set(columns)) < len(columns):
+            raise LaeError(f"{self.label!r:.80}: name one stage or several, each once")
+
+    @property
+    def label(self) -> str:
+        """The name of the source in tables."""
+        return f"stage:{'+'.join(self.stages)}"
+
+    def __call__(self, recording: Recording) -> Times:
+        """The times of a recording."""
+        for name in self.stages:
+            if name not in recording.stages:
+                there = ", ".join(in_order(recording.stages)) or "none"
+                raise LaeError(
+                    f"sequence {recording.name!r}: the trace has no times of stage {name!r} "
+                    f"(column {stage_column(name)}); of the stages in it there are {there}"
+                )
+        parts = np.array([recording.stages[name] for name in self.stages])
+        ns = np.where((parts < 0).any(0), -1, parts.sum(0))
+        absent = f"the trace has no time of {' and '.join(self.stages)} for it"
+        return Times(
+            recording.name, ns, absent=f"{absent}; that of frame 0 may be given, as ,init=TIME"
+        )
 
 
 def constant(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
+from itertools import chain, pairwise
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -13,9 +15,9 @@ from lae_sim._arrays import Floats, Ints
 from lae_sim.boxes import PARTED_IOU, iou
 from lae_sim.engine.arrivals import same_arrivals, with_arrivals
 from lae_sim.engine.clock import Clock
-from lae_sim.engine.lanes import batchable, simulate_lanes
+from lae_sim.engine.lanes import batchable, simulate_many
 from lae_sim.engine.policies import latest
-from lae_sim.engine.scheduler import Policy, Schedule, Service, simulate
+from lae_sim.engine.scheduler import Policy, Schedule, Schedules, Service, simulate
 from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
@@ -25,6 +27,8 @@ from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes
 from lae_sim.trace.recording import BESIDE, Recording, batched
+
+Item = TypeVar("Item")
 
 _GROUP_FRAMES = 1 << 16  # world frames of the sequences that are in memory at once
 _LEAST = 0.2  # weight of the farther of two strides beside a step
@@ -121,7 +125,155 @@ def replay_sequence(
     if isinstance(image_size, tuple):
         image_size = ImageSizes.constant(image_size)
     job = _Job(recording, times, strided or {}, clock, stride, search, image_size)
-    return job.run(simulate(len(recording), job.clock, source(job.times), policy))
+    schedule = simulate(len(recording), job.clock, source(job.times), policy)
+    return _run([job], Schedules.of([schedule]), np.zeros(1, np.int64))[0]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RunBatch:
+    """R runs in arrays, one after another: what is done with each takes a fraction of the time.
+
+    Attributes:
+        recordings: of each run.
+        schedules: of the runs, with n processed frames.
+        boxes: see :class:`Run`, float64 [n, 4].
+        departures, disagreement: see :class:`Run`, int64 [R] and float64 [R].
+        modelled: see :class:`Run`.
+        repetition: of each, int64 [R]; 0 where times are not drawn again and again.
+    """
+
+    recordings: tuple[Recording, ...]
+    schedules: Schedules
+    boxes: Floats
+    departures: Ints
+    disagreement: Floats
+    modelled: tuple[Outcomes | None, ...]
+    repetition: Ints
+
+    def __len__(self) -> int:
+        """Number of runs R."""
+        return len(self.recordings)
+
+    def __getitem__(self, r: int) -> Run:
+        """One of them."""
+        return Run(
+            self.recordings[r],
+            self.schedules[r],
+            self.boxes[self.schedules.offsets[r] : self.schedules.offsets[r + 1]],
+            int(self.departures[r]),
+            float(self.disagreement[r]),
+            self.modelled[r],
+        )
+
+    def __iter__(self) -> Iterator[Run]:
+        """Each, in order."""
+        return map(self.__getitem__, range(len(self)))
+
+    def part(self, begin: int, end: int) -> RunBatch:
+        """Some of them, one after another."""
+        some, offsets = slice(begin, end), self.schedules.offsets
+        return RunBatch(
+            self.recordings[some],
+            self.schedules.part(begin, end),
+            self.boxes[offsets[begin] : offsets[end]],
+            self.departures[some],
+            self.disagreement[some],
+            self.modelled[some],
+            self.repetition[some],
+        )
+
+    @classmethod
+    def of(cls, runs: Sequence[Run]) -> RunBatch:
+        """Some runs, at least one, as a batch."""
+        return cls(
+            tuple(run.recording for run in runs),
+            Schedules.of([run.schedule for run in runs]),
+            np.concatenate([run.boxes for run in runs]),
+            np.array([run.departures for run in runs], np.int64),
+            np.array([run.disagreement for run in runs]),
+            tuple(run.modelled for run in runs),
+            np.zeros(len(runs), np.int64),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[RunBatch]) -> RunBatch:
+        """Several batches as one."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            tuple(chain.from_iterable(part.recordings for part in parts)),
+            Schedules.joined([part.schedules for part in parts]),
+            np.concatenate([part.boxes for part in parts]),
+            np.concatenate([part.departures for part in parts]),
+            np.concatenate([part.disagreement for part in parts]),
+            tuple(chain.from_iterable(part.modelled for part in parts)),
+            np.concatenate([part.repetition for part in parts]),
+        )
+
+    @cached_property
+    def distinct(self) -> tuple[list[Recording], Ints]:
+        """The recordings, each once, and the place of each run's among them, int64 [R]."""
+        return distinct(self.recordings)
+
+
+def distinct(items: Iterable[Item]) -> tuple[list[Item], Ints]:
+    """Objects, each once, in the order of their first places, and where each stands, int64 [n]."""
+    found: dict[int, Item] = {}
+    places: dict[int, int] = {}
+    which = []
+    for item in items:
+        found[id(item)] = item
+        which.append(places.setdefault(id(item), len(places)))
+    return list(found.values()), np.array(which, np.int64)
+
+
+@runtime_checkable
+class Batched(Protocol):
+    """Runs that come in batches, if one asks for that."""
+
+    def batches(self) -> Iterator[RunBatch]:
+        """All of them."""
+
+
+def grouped(runs: Iterable[Run], frames: int) -> Iterator[RunBatch]:
+    """Runs in groups of about so many world frames, as :func:`.recording.batched` counts them."""
+    if not isinstance(runs, Batched):
+        yield from map(RunBatch.of, batched(runs, frames, BESIDE))
+        return
+    parts: list[RunBatch] = []
+    pending = 0
+    for batch in runs.batches():
+        sizes = np.cumsum(batch.schedules.lengths + BESIDE)
+        begin = before = 0
+        while begin < len(batch):
+            end = int(np.searchsorted(sizes, before + frames - pending)) + 1
+            part = batch.part(begin, min(end, len(batch)))
+            begin += len(part)
+            parts.append(part)
+            pending += int(sizes[begin - 1]) - before
+            before = int(sizes[begin - 1])
+            if pending >= frames:
+                yield RunBatch.joined(parts)
+                parts, pending = [], 0
+    if parts:
+        yield RunBatch.joined(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    """A recording, with the stride it has if it holds every frame."""
+
+    recording: Recording
+    stride: Fraction
+
+    @cached_property
+    def before(self) -> Ints:
+        """The frame that each one followed when recorded, or would have, int64 [T]; 0: -1."""
+        if self.stride > 1:
+            return followed(self.stride, len(self.recording))
+        processed = ~np.isnan(self.recording.boxes[:, 0])
+        latest_one = np.maximum.accumulate(np.where(processed, np.arange(len(processed)), -1))
+        return np.concatenate([[-1], latest_one[:-1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,40 +312,90 @@ class _Job:
     def __len__(self) -> int:
         return len(self.recording)
 
-    def run(self, schedule: Schedule) -> Run:
-        frames = schedule.frames
-        passes = {self.stride: self.recording, **self.passes}
-        strides = sorted(passes)
-        nearest = _nearest(strides, frames)
-        stride = strides[nearest]
-        boxes = _boxes(passes[stride], frames)
-        before = self.before if stride == self.stride else _before(passes[stride], stride)
-        departures = _departures(before, frames)
-        disagreement = np.nan
-        if self.passes:
-            parted = np.zeros(len(frames), bool)
-            for other in strides[max(nearest - 1, 0) : nearest + 2] if departures else ():
-                parted |= iou(_boxes(passes[other], frames), boxes) < PARTED_IOU
-            disagreement = float(parted.mean())
-        run = Run(self.recording, schedule, boxes, departures, disagreement)
+    @cached_property
+    def own(self) -> _Pass:
+        """Its own recording."""
+        return _Pass(self.recording, self.stride)
+
+    @cached_property
+    def all_passes(self) -> list[_Pass]:
+        """That and the other passes, by stride."""
+        others = {stride: _Pass(recording, stride) for stride, recording in self.passes.items()}
+        return sorted({self.stride: self.own, **others}.values(), key=lambda each: each.stride)
+
+    def nearest(self, frames: Ints) -> _Pass:
+        """The pass whose stride is nearest to the mean step of some processed frames."""
+        step = Fraction(int(frames[-1]), max(len(frames) - 1, 1))
+        return min(self.all_passes, key=lambda each: abs(each.stride - step))
+
+    def disagreement(self, used: _Pass, frames: Ints, boxes: Floats, departures: int) -> float:
+        """The share of frames where a pass beside the one that is used has another box."""
+        parted = np.zeros(len(frames), bool)
+        nearest = self.all_passes.index(used)
+        for other in self.all_passes[max(nearest - 1, 0) : nearest + 2] if departures else ():
+            parted |= iou(_boxes(other.recording, frames), boxes) < PARTED_IOU
+        return float(parted.mean())
+
+    def modelled(
+        self, used: _Pass, frames: Ints, boxes: Floats, departures: int
+    ) -> Outcomes | None:
+        """What the search model makes of a run; None where it is off, or the replay exact."""
         if self.search is None or len(frames) == 1:
-            return run
+            return None
         if not departures and self.search.pre_forecaster is None:
-            return run
-        farther = np.append(False, np.diff(frames) > (frames - before.take(frames))[1:])
+            return None
+        recorded_steps = frames - used.before.take(frames)
+        farther = np.append(False, np.diff(frames) > recorded_steps[1:])
         recorded = [RecordedAnswers(boxes, farther)]
         if self.passes:
-            for other, weight in _beside(strides, frames).items():
+            passes = {each.stride: each.recording for each in self.all_passes}
+            for other, weight in _beside(list(passes), frames).items():
                 recorded += phase_answers(other, passes[other], frames, weight)
         sizes, times = self.image_sizes, None
         if not self.clock.is_even:
             times = [self.clock.frame_time(frame) for frame in frames.tolist()]
-        modelled = self.search.outcomes(self.recording, frames, recorded, sizes, times)
-        return replace(run, modelled=modelled)
+        return self.search.outcomes(self.recording, frames, recorded, sizes, times)
 
-    @cached_property
-    def before(self) -> Ints:
-        return _before(self.recording, self.stride)
+
+def _run(jobs: Sequence[_Job], schedules: Schedules, repetition: Ints) -> RunBatch:
+    """The runs of some jobs, by their schedules."""
+    ends = schedules.offsets[1:]
+    of_run = [slice(*span) for span in pairwise(schedules.offsets.tolist())]
+    used = [
+        job.nearest(schedules.frames[calls]) if job.passes else job.own
+        for job, calls in zip(jobs, of_run)
+    ]
+    tables, which = distinct(used)
+    lengths = [len(each.recording) for each in tables]
+    row = np.repeat((np.cumsum(lengths) - lengths)[which], np.diff(schedules.offsets))
+    row += schedules.frames
+    boxes = np.concatenate([each.recording.boxes for each in tables]).take(row, axis=0)
+    absent = np.isnan(boxes[:, 0])
+    if absent.any():
+        r = int(np.searchsorted(ends, absent.argmax(), "right"))
+        _boxes(used[r].recording, schedules.frames[of_run[r]])
+    departs = np.concatenate([each.before for each in tables]).take(row)
+    departs[1:] -= schedules.frames[:-1]
+    departs[schedules.offsets[:-1]] = 0
+    departures = np.add.reduceat(departs != 0, schedules.offsets[:-1], dtype=np.int64)
+    disagreement = np.full(len(jobs), np.nan)
+    modelled: list[Outcomes | None] = [None] * len(jobs)
+    for r, job in enumerate(jobs):
+        if not job.passes and job.search is None:
+            continue
+        own = used[r], schedules.frames[of_run[r]], boxes[of_run[r]], int(departures[r])
+        if job.passes:
+            disagreement[r] = job.disagreement(*own)
+        modelled[r] = job.modelled(*own)
+    return RunBatch(
+        tuple(job.recording for job in jobs),
+        schedules,
+        boxes,
+        departures,
+        disagreement,
+        tuple(modelled),
+        repetition,
+    )
 
 
 def _boxes(recording: Recording, frames: Ints) -> Floats:
@@ -206,26 +408,6 @@ def _boxes(recording: Recording, frames: Ints) -> Floats:
             "box for it, since the tracker skipped it; replay a trace of every frame instead"
         )
     return boxes
-
-
-def _before(recording: Recording, stride: Fraction) -> Ints:
-    """The frame that each one followed when it was recorded, or would have, int64 [T]; 0: -1."""
-    if stride > 1:
-        return followed(stride, len(recording))
-    processed = ~np.isnan(recording.boxes[:, 0])
-    latest_one = np.maximum.accumulate(np.where(processed, np.arange(len(processed)), -1))
-    return np.concatenate([[-1], latest_one[:-1]])
-
-
-def _departures(before: Ints, frames: Ints) -> int:
-    """How many of some frames followed another one when they were recorded."""
-    return int(np.count_nonzero(before.take(frames[1:]) != frames[:-1]))
-
-
-def _nearest(strides: Sequence[Fraction], frames: Ints) -> int:
-    """The stride nearest to the mean step of some processed frames, by its place."""
-    step = Fraction(int(frames[-1]), max(len(frames) - 1, 1))
-    return min(range(len(strides)), key=lambda k: abs(strides[k] - step))
 
 
 def _beside(strides: Sequence[Fraction], frames: Ints) -> dict[Fraction, float]:
@@ -333,8 +515,12 @@ class Runs:
         return self.trace if self.timing is None else self.timing
 
     def __iter__(self) -> Iterator[Run]:
+        return chain.from_iterable(self.batches())
+
+    def batches(self) -> Iterator[RunBatch]:
+        """The runs in batches, as many as are scheduled at once."""
         for jobs, services in self._groups():
-            yield from _replayed(jobs, services, self.policy)
+            yield from _replayed(jobs, services, self.policy, np.zeros(len(jobs), np.int64))
 
     def _groups(self) -> Iterator[tuple[list[_Job], list[Service]]]:
         """Jobs with their services, as many as can be scheduled at once and be in memory.
@@ -415,30 +601,63 @@ def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[in
         LaeError: if the times are not random, or a sequence or frame that is asked for is not
             there.
     """
-    source = runs.source
-    if not isinstance(source, RandomSource):
-        raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
-    for jobs in batched(runs._jobs(), _GROUP_FRAMES, BESIDE):
-        size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
-        for begin in range(first, first + count, size):
-            some = range(begin, min(begin + size, first + count))
-            drawn = [source.repeated(job.times, begin, len(some)) for job in jobs]
-            times = [
-                Times(job.recording.name, rows[k], by_call=True)
-                for k in range(len(some))
-                for job, rows in zip(jobs, drawn)
-            ]
-            replayed = _replayed(jobs * len(some), times, runs.policy)
-            yield from ((r, next(replayed)) for r in some for _ in jobs)
+    for batch in Repetitions(runs, count, first).batches():
+        yield from zip(batch.repetition.tolist(), batch)
 
 
-def _replayed(jobs: Sequence[_Job], services: Sequence[Service], policy: Policy) -> Iterator[Run]:
+@dataclass(frozen=True, eq=False)
+class Repetitions:
+    """The runs of :func:`replay_repeated`, for those who can do with many at once.
+
+    Attributes:
+        runs: of a trace with random times; the repetition of their source does not count.
+        count: number of repetitions.
+        first: the first repetition.
+    """
+
+    runs: Runs
+    count: int
+    first: int = 0
+
+    def __iter__(self) -> Iterator[Run]:
+        return chain.from_iterable(self.batches())
+
+    def batches(self) -> Iterator[RunBatch]:
+        """The runs in batches, as many as are scheduled at once.
+
+        Raises:
+            LaeError: as :func:`replay_repeated`.
+        """
+        source, first, count = self.runs.source, self.first, self.count
+        if not isinstance(source, RandomSource):
+            raise LaeError("only random times can be drawn again: bootstrap, resample or lognormal")
+        for jobs in batched(self.runs._jobs(), _GROUP_FRAMES, BESIDE):
+            size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
+            for begin in range(first, first + count, size):
+                some = range(begin, min(begin + size, first + count))
+                drawn = [source.repeated(job.times, begin, len(some)) for job in jobs]
+                times = [
+                    Times(job.recording.name, rows[k], by_call=True)
+                    for k in range(len(some))
+                    for job, rows in zip(jobs, drawn)
+                ]
+                repetition = np.repeat(np.array(some), len(jobs))
+                yield from _replayed(jobs * len(some), times, self.runs.policy, repetition)
+
+
+def _replayed(
+    jobs: Sequence[_Job], services: Sequence[Service], policy: Policy, repetition: Ints
+) -> Iterator[RunBatch]:
+    """The runs of some jobs, which have a service and a repetition each."""
     clocks = [job.clock for job in jobs]
-    schedules = simulate_lanes([len(job) for job in jobs], clocks, services, policy)
-    for job in jobs:
-        with explained(f"sequence {job.recording.name!r}: policy or latency"):
-            schedule = next(schedules)
-        yield job.run(schedule)
+    schedules = simulate_many([len(job) for job in jobs], clocks, services, policy)
+    begin = 0
+    while begin < len(jobs):
+        with explained(f"sequence {jobs[begin].recording.name!r}: policy or latency"):
+            some = next(schedules)
+        those = slice(begin, begin + len(some))
+        yield _run(jobs[those], some, repetition[those])
+        begin += len(some)
 
 
 def _recordings(trace: Trace, forget_arrivals: bool) -> Iterator[Recording]:

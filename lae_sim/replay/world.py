@@ -54,8 +54,9 @@ TraceLike: TypeAlias = "str | os.PathLike[str] | Trace"
 Value = TypeVar("Value")
 
 _POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime")
-_LATENCIES = ("recorded", "by-call", "constant", "resample", "lognormal", "bootstrap")
+_LATENCIES = ("recorded", "by-call", "stage", "constant", "resample", "lognormal", "bootstrap")
 
+_TRACES_OWN = (RandomSource, sources.StageTimes)  # sources whose initialisations are the trace's
 _TRACE = (str, os.PathLike, Trace)
 _A_TRACE = "a path, a URL or what read_trace gives"
 
@@ -286,7 +287,7 @@ class World:
             found = f"{ASSUMED}{source.init_ns / 1e6:g} ms"
         elif isinstance(source, Constant):
             found = AS_A_FRAME
-        elif isinstance(source, RandomSource) or source in (sources.by_frame, sources.by_call):
+        elif isinstance(source, _TRACES_OWN) or source in (sources.by_frame, sources.by_call):
             found = times.init_source
         else:
             found = f"given by {label_of(self.latency)}"
@@ -448,6 +449,8 @@ def parse_latency(text: str) -> LatencySource:
         return sources.by_frame
     if text == "by-call":
         return sources.by_call
+    if name == "stage":
+        return named(f"latency {shown(text)}", _stages, value)
     if name == "constant":
         return sources.constant(value)
     if name == "resample":
@@ -465,10 +468,14 @@ def parse_latency(text: str) -> LatencySource:
         unit = "" if text[-1:].isalpha() else "ms"
         meant = f"; did you mean constant:{text:.40}{unit}?"
     raise LaeError(
-        f"no latency {shown(text)}: there are recorded, by-call, constant:47ms, resample:SEED, "
-        f"lognormal:SEED, bootstrap:SEED[:BLOCK], package.module:object, all of them perhaps with "
-        f",init=TIME{meant}"
+        f"no latency {shown(text)}: there are recorded, by-call, stage:NAME[+NAME], "
+        "constant:47ms, resample:SEED, lognormal:SEED, bootstrap:SEED[:BLOCK], "
+        f"package.module:object, all of them perhaps with ,init=TIME{meant}"
     )
+
+
+def _stages(value: str) -> sources.StageTimes:
+    return sources.StageTimes(tuple(value.split("+")))
 
 
 def parse_sigmas(value: Number | Iterable[Number]) -> tuple[Fraction, ...]:

@@ -44,6 +44,8 @@ def overview(report: Mapping[str, Any]) -> str:
     if failures:
         lines.append(_entry("failures", f"{len(failures)}: {_words(failures[:5])}"))
     lines += [*_readings(provenance.get("device")), "", *_times(report)]
+    if times["stages"]:
+        lines += ["", *_stages(times["stages"])]
     if times["histogram"]:
         lines += ["", *_histogram(times["histogram"])]
     lines += ["", *_drift(times), *_stalls(times["stalls"])]
@@ -153,6 +155,17 @@ def _times(report: Mapping[str, Any]) -> list[str]:
     share, interval = 100 * times["slower_than_frames"], _figure(times["frame_interval_ms"])
     late = f"{share:.3g}% of the calls take longer than the interval between frames, {interval} ms"
     return [*text_of(table).splitlines(), late, _words(InitCost(**report["init"]))]
+
+
+def _stages(stages: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What each stage of the calls takes."""
+    columns = [
+        Column("stages, ms", lambda row: row["stage"] or "(the rest)", is_label=True),
+        Column("n", "n", COUNT),
+        *(Column(name, f"{name}_ms", _figure) for name in ("median", "p95")),
+        Column("share", "share", lambda share: f"{100 * share:.1f}%"),
+    ]
+    return text_of(Table.of(columns, stages)).splitlines()
 
 
 def _figure(value: float) -> str:

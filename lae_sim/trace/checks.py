@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+from collections.abc import Iterable
 from typing import Any, NoReturn
 
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import MOST_PIXELS, iou
-from lae_sim.errors import TraceError
+from lae_sim.errors import LaeError, TraceError
 from lae_sim.trace.columns import BOX, TRUTH, Nullable, Rows
 from lae_sim.trace.metadata import text_fault
-from lae_sim.trace.recording import OPTIONAL_COLUMNS
+from lae_sim.trace.recording import OPTIONAL_COLUMNS, stage_column, stage_of
 from lae_sim.trace.restarts import is_restart
 
 COLUMN_TYPES = {
@@ -35,20 +38,32 @@ def check_schema(schema: Any, where: str) -> None:
     Raises:
         TraceError: for the first column that is missing or of another type.
     """
-    for name, expected in COLUMN_TYPES.items():
-        indices = schema.get_all_field_indices(name)
-        if len(indices) > 1:
-            raise TraceError(f"{where}: column {name!r} is there {len(indices)} times")
-        if not indices:
-            if name in OPTIONAL and not (name in TRUTH and set(TRUTH) & set(schema.names)):
+    there = Counter(schema.names)
+    for name, expected in {**COLUMN_TYPES, **_stage_types(there, where)}.items():
+        if there[name] > 1:
+            raise TraceError(f"{where}: column {name!r} is there {there[name]} times")
+        if not there[name]:
+            if name in OPTIONAL and not (name in TRUTH and set(TRUTH) & set(there)):
                 continue
             raise TraceError(f"{where}: column {name!r} is missing: is this a lae_sim trace?")
-        actual = _type_name(schema.field(indices[0]).type)
+        actual = _type_name(schema.field(name).type)
         if actual != expected:
             raise TraceError(
                 f"{where}: column {name!r} is {actual}, must be {expected}"
                 + _cause_of_type(name, actual)
             )
+
+
+def _stage_types(columns: Iterable[str], where: str) -> dict[str, str]:
+    """The types of those columns that have the times of stages."""
+    types = {}
+    for column in columns:
+        if found := re.fullmatch("stage_(.*)_ns", column):
+            try:
+                types[stage_column(found[1])] = "int64"
+            except LaeError as error:
+                raise TraceError(f"{where}: column {column!r:.100}: {error}") from error
+    return types
 
 
 def _type_name(arrow_type: Any) -> str:
@@ -60,7 +75,7 @@ def _type_name(arrow_type: Any) -> str:
 
 
 def _cause_of_type(name: str, actual: str) -> str:
-    if name in ("elapsed_ns", "arrival_ns") and actual in ("double", "float", "halffloat"):
+    if name.endswith("_ns") and actual in ("double", "float", "halffloat"):
         return ": are these seconds or milliseconds? Write whole nanoseconds"
     return ""
 
@@ -91,8 +106,9 @@ class RowChecker:
         self._check_order(rows)
         self._check_nulls(rows)
         self._check_values(rows)
-        if rows.arrival_ns is not None:
-            self._check_arrivals(rows, rows.arrival_ns)
+        if "arrival_ns" in rows.optional:
+            self._check_arrivals(rows, rows.optional["arrival_ns"])
+        self._check_stages(rows)
         if not self.profiled:
             self._check_units(rows)
 
@@ -193,14 +209,33 @@ class RowChecker:
             self._fail(rows, row, "arrival_ns", problem)
         self._last_arrival_ns = int(times[-1])
 
+    def _check_stages(self, rows: Rows) -> None:
+        left = rows.elapsed_ns.copy()
+        for name in filter(stage_of, rows.optional):
+            column = rows.optional[name]
+            known = ~column.null
+            for wrong, problem in (
+                (known & rows.elapsed_null, "a time, but the frame was not processed"),
+                (known & (column.values < 0), "negative time {0} ns"),
+                (
+                    known & (column.values > left),
+                    "{0} ns: the parts of elapsed_ns take longer than it, {1} ns",
+                ),
+            ):
+                if wrong.any():
+                    row = int(np.argmax(wrong))
+                    text = problem.format(column.values[row], rows.elapsed_ns[row])
+                    self._fail(rows, row, name, text)
+            left -= np.where(known, column.values, 0)
+
     def _check_units(self, rows: Rows) -> None:
         times = rows.elapsed_ns[rows.elapsed_ns > 0]
         typical = float(np.median(times)) if len(times) > 1 else 0.0
         if 2 <= typical < _LEAST_TYPICAL_NS:
             row = int(np.argmax(rows.elapsed_ns > 0))
             self._fail(rows, row, "elapsed_ns", _cause_of_times(f"median {typical:g}", typical))
-        if rows.arrival_ns is not None and len(rows.frame) > 1:
-            steps = np.diff(rows.arrival_ns.values)[rows.frame[1:] > 0]
+        if "arrival_ns" in rows.optional and len(rows.frame) > 1:
+            steps = np.diff(rows.optional["arrival_ns"].values)[rows.frame[1:] > 0]
             typical = float(np.median(steps)) if len(steps) else 0.0
             if 1 <= typical < _LEAST_TYPICAL_NS:
                 problem = _cause_of_times(f"{typical:g} from frame to frame", typical)

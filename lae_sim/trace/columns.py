@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lae_sim._arrays import Bools, Floats, Ints
-from lae_sim.trace.recording import OPTIONAL_COLUMNS, Recording
+from lae_sim.trace.recording import OPTIONAL_COLUMNS, Recording, is_optional, stage_of
 
 TRUTH = ("truth_x", "truth_y", "truth_w", "truth_h")
 BOX = ("x", "y", "w", "h")
@@ -26,13 +26,20 @@ class Nullable:
     @classmethod
     def of_recordings(cls, name: str, recordings: Sequence[Recording]) -> Nullable:
         """That of an optional column; null in those recordings that lack it."""
-        found = [getattr(recording, name) for recording in recordings]
+        found = [recording.columns.get(name) for recording in recordings]
         lengths = [len(recording) for recording in recordings]
         filled = [
-            np.ones(length, OPTIONAL_COLUMNS[name]) if values is None else values
+            # -1 is a time that is unknown, and True as a flag
+            np.full(length, -1, OPTIONAL_COLUMNS.get(name, np.int64)) if values is None else values
             for values, length in zip(found, lengths)
         ]
-        return cls(np.concatenate(filled), np.repeat([v is None for v in found], lengths))
+        values, null = np.concatenate(filled), np.repeat([v is None for v in found], lengths)
+        return cls(values, null if stage_of(name) is None else null | (values == -1))
+
+    def of_run(self, run: slice) -> Nullable | None:
+        """That of a sequence's rows; None if nothing is said in any of them."""
+        null = self.null[run]
+        return None if null.all() else Nullable(self.values[run], null)
 
 
 @dataclass(frozen=True)
@@ -49,8 +56,7 @@ class Rows:
         elapsed_null: bool [n].
         score: float32 [n], NaN where null.
         score_null: bool [n].
-        arrival_ns: int64, None without that column.
-        visible: bool, None without that column.
+        optional: the optional columns that are there, by name.
     """
 
     names: list[str]
@@ -64,8 +70,7 @@ class Rows:
     elapsed_null: Bools
     score: npt.NDArray[np.float32]
     score_null: Bools
-    arrival_ns: Nullable | None = None
-    visible: Nullable | None = None
+    optional: Mapping[str, Nullable] = field(default_factory=dict)
 
     @classmethod
     def of_recordings(cls, recordings: Sequence[Recording], columns: Iterable[str] = ()) -> Rows:
@@ -88,7 +93,7 @@ class Rows:
             elapsed_null=elapsed == -1,
             score=score,
             score_null=np.isnan(score),
-            **{name: Nullable.of_recordings(name, recordings) for name in names},
+            optional={name: Nullable.of_recordings(name, recordings) for name in names},
         )
 
     @classmethod
@@ -120,8 +125,14 @@ class Rows:
             elapsed_null=elapsed_null,
             score=score,
             score_null=score_null,
-            arrival_ns=_nullable(column.get("arrival_ns"), np.int64),
-            visible=_nullable(column.get("visible"), np.bool_),
+            optional={
+                name: Nullable(
+                    to_numpy(column[name], OPTIONAL_COLUMNS.get(name, np.int64)),
+                    is_null(column[name]),
+                )
+                for name in column
+                if is_optional(name)
+            },
         )
 
     def to_batch(self, schema: Any) -> Any:
@@ -139,7 +150,7 @@ class Rows:
             from_numpy(self.score, ~self.score_null),
         ]
         for name in schema.names[len(columns) :]:
-            column: Nullable = getattr(self, name)
+            column = self.optional[name]
             columns.append(from_numpy(column.values, ~column.null))
         return pa.RecordBatch.from_arrays(columns, schema=schema)
 
@@ -147,28 +158,23 @@ class Rows:
         """Each run of rows as a recording."""
         for name, start, end in zip(self.names, self.starts[:-1], self.starts[1:]):
             run = slice(start, end)
+            said = {column: values.of_run(run) for column, values in self.optional.items()}
+            arrived, visible = said.pop("arrival_ns", None), said.pop("visible", None)
             yield Recording(
                 name,
                 self.truth[run],
                 self.boxes[run],
                 self.elapsed_ns[run],
                 self.score[run],
-                None if self.arrival_ns is None else self.arrival_ns.values[run],
-                None if self.visible is None else _flags(self.visible, run),
+                None if arrived is None else arrived.values,
+                # a frame of which nothing is said counts as one where the target is visible
+                None if visible is None else visible.values | visible.null,
+                {
+                    str(stage_of(column)): np.where(each.null, -1, each.values)
+                    for column, each in said.items()
+                    if each is not None
+                },
             )
-
-
-def _nullable(column: Any, dtype: npt.DTypeLike) -> Nullable | None:
-    return None if column is None else Nullable(to_numpy(column, dtype), is_null(column))
-
-
-def _flags(visible: Nullable, run: slice) -> Bools | None:
-    """The flags of a sequence, or None if nothing is said of any of its frames.
-
-    A frame of which nothing is said counts as one where the target is visible.
-    """
-    null = visible.null[run]
-    return None if null.all() else visible.values[run] | null
 
 
 def _boxes(column: dict[str, Any], names: tuple[str, ...], n: int) -> tuple[Floats, Bools]:

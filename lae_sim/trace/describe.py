@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.trace.metadata import TRACES_TIMES
-from lae_sim.trace.recording import Recording
+from lae_sim.trace.recording import Recording, in_order
 
 if TYPE_CHECKING:
     from lae_sim.trace.file import Trace
@@ -90,19 +90,22 @@ class SequenceTimes:
         init_ns: time of the initialisation on frame 0, ns.
         frames: the other frames that were processed, int32 [n].
         elapsed_ns: their times in ns, int64 [n].
+        stages: parts of them by the name of the stage, int64 [n] each, -1 where unknown.
     """
 
     name: str
     init_ns: int
     frames: npt.NDArray[np.int32]
     elapsed_ns: Ints
+    stages: Mapping[str, Ints] = field(default_factory=dict)
 
     @classmethod
     def of(cls, recording: Recording) -> SequenceTimes:
         """The times of a recording."""
         frames = np.flatnonzero(recording.elapsed_ns >= 0)[1:].astype(np.int32)
         init = int(recording.elapsed_ns[0])
-        return cls(recording.name, init, frames, recording.elapsed_ns[frames])
+        stages = {name: ns[frames] for name, ns in recording.stages.items()}
+        return cls(recording.name, init, frames, recording.elapsed_ns[frames], stages)
 
 
 def summary(elapsed_ns: Ints) -> dict[str, float]:
@@ -114,6 +117,33 @@ def summary(elapsed_ns: Ints) -> dict[str, float]:
     figures = {"n": len(elapsed_ns), "mean_ms": mean, "median_ms": p50, "p90_ms": p90}
     figures |= {"p95_ms": p95, "p99_ms": p99, "max_ms": top}
     return figures | ({"fps": 1e3 / mean} if mean else {})
+
+
+def stage_times(sequences: Sequence[SequenceTimes]) -> list[dict[str, Any]]:
+    """What the stages of the calls take, in their order, and last what is left to none of them.
+
+    Returns:
+        For each ``stage``, None for what is left: ``n``, the calls that tell, ``mean_ms``,
+        ``median_ms``, ``p95_ms``, and its ``share`` of the time of these calls. Empty without
+        stages.
+    """
+    names = in_order({name for sequence in sequences for name in sequence.stages})
+    if not names:
+        return []
+    elapsed_ns = np.concatenate([sequence.elapsed_ns for sequence in sequences])
+    unknown = [np.full(len(sequence.elapsed_ns), -1) for sequence in sequences]
+    parts = np.array(
+        [np.concatenate([s.stages.get(n, u) for s, u in zip(sequences, unknown)]) for n in names]
+    )
+    rest = elapsed_ns - np.maximum(parts, 0).sum(0)
+    rows: list[dict[str, Any]] = []
+    for name, ns in zip([*names, None], [*parts, np.where((parts >= 0).any(0), rest, -1)]):
+        found = summary(ns[ns >= 0])
+        if found["n"]:
+            figures = {key: found[key] for key in ("n", "mean_ms", "median_ms", "p95_ms")}
+            share = float(ns[ns >= 0].sum() / max(elapsed_ns[ns >= 0].sum(), 1))
+            rows.append({"stage": name, **figures, "share": share})
+    return rows
 
 
 def share_slower(elapsed_ns: Ints, fps: Fraction) -> float:
@@ -309,6 +339,7 @@ def describe(trace: Trace, path: str) -> tuple[Report, list[SequenceTimes]]:
         "times": {
             "calls": summary(calls),
             "initialisations": summary(np.array([s.init_ns for s in sequences])),
+            "stages": stage_times(sequences),
             "frame_interval_ms": float(1000 / metadata.fps),
             "slower_than_frames": share_slower(calls, metadata.fps),
             "histogram": histogram(calls) if len(calls) else None,

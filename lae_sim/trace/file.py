@@ -20,15 +20,24 @@ from lae_sim.decoding import Budget, json_memory
 from lae_sim.errors import LaeError, TraceError, hint, listed, shown
 from lae_sim.files import sequence_names, written_whole
 from lae_sim.trace.checks import COLUMN_TYPES, RowChecker, check_schema
-from lae_sim.trace.columns import BOX, TRUTH, Nullable, Rows, checksums
+from lae_sim.trace.columns import Nullable, Rows, checksums
 from lae_sim.trace.locate import is_url, opened
 from lae_sim.trace.metadata import Metadata
-from lae_sim.trace.recording import BATCH_ROWS, OPTIONAL_COLUMNS, Recording, batched
+from lae_sim.trace.recording import (
+    BATCH_ROWS,
+    Recording,
+    batched,
+    in_order,
+    is_optional,
+    stage_column,
+    stage_of,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 HELD_FRAMES = 1 << 18
+_FLOATS, _INTEGERS = ("double", "float32"), ("int32", "int64")
 _ROW_BYTES = 8 + 3 * 8 * 4 + 4  # truth, box and what is put together of them, time and score
 
 
@@ -44,9 +53,9 @@ class Trace:
         metadata: what the trace says of itself.
         recordings: one per sequence.
         frames: world frames of all its sequences together, where known.
-        columns: those of :data:`~lae_sim.trace.recording.OPTIONAL_COLUMNS` that its recordings may
-            have. Only of a stream need it be given, to be written with those that its first
-            recording lacks.
+        columns: the optional columns that its recordings may have: ``arrival_ns``, ``visible`` and
+            those of stages. Only of a stream need they be given, to be written with those that its
+            first recording lacks.
 
     Example:
         >>> import lae_sim
@@ -207,8 +216,9 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
     groups = batched(trace)
     first = next(groups, [])
     columns = _columns(trace, first)
-    types = {**COLUMN_TYPES, "score": "float32"}
-    kept = [name for name in types if name not in OPTIONAL_COLUMNS or name in columns]
+    stages = [stage_column(name) for name in in_order(filter(None, map(stage_of, columns)))]
+    types = {**COLUMN_TYPES, "score": "float32", **dict.fromkeys(stages, "int64")}
+    kept = [name for name in types if not is_optional(name) or name in columns]
     metadata = trace.metadata.with_columns() if columns else trace.metadata
     never_null = ("sequence", "frame", "arrival_ns")
     schema = pa.schema(
@@ -226,10 +236,9 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
             compression_level=1,
             use_dictionary=["sequence"],
             column_encoding={
-                **dict.fromkeys((*TRUTH, *BOX, "score"), "BYTE_STREAM_SPLIT"),
-                "frame": "DELTA_BINARY_PACKED",
-                "elapsed_ns": "DELTA_BINARY_PACKED",
-                **({"arrival_ns": "DELTA_BINARY_PACKED"} if "arrival_ns" in columns else {}),
+                name: "BYTE_STREAM_SPLIT" if types[name] in _FLOATS else "DELTA_BINARY_PACKED"
+                for name in kept
+                if types[name] in (*_FLOATS, *_INTEGERS)
             },
             **checksums("write_page_checksum"),
         ) as writer,
@@ -238,7 +247,7 @@ def write_trace(trace: Trace, path: str | os.PathLike[str]) -> None:
             for recording in group:
                 if not len(recording):
                     raise TraceError(f"{path}: sequence {recording.name!r} has no frames")
-                if more := set(recording.columns) - columns:
+                if more := recording.columns.keys() - columns:
                     raise TraceError(
                         f"{path}: sequence {recording.name!r} has {', '.join(sorted(more))}, which "
                         "the first ones lack: name such columns when the trace is made "
@@ -306,7 +315,7 @@ class _StoredRecordings:
                 )
             Budget(self.path, TraceError).take(json_memory(stored))
             try:
-                columns = frozenset(OPTIONAL_COLUMNS).intersection(file.schema_arrow.names)
+                columns = frozenset(filter(is_optional, file.schema_arrow.names))
                 return Metadata.parse(stored), file.metadata.num_rows, columns
             except TraceError as error:
                 raise TraceError(f"{self.path}: {error}") from error
@@ -361,7 +370,7 @@ class _StoredRecordings:
                 if parts and recording.name != parts[0].name:
                     yield _joined(parts)
                     parts, budget = [], Budget(self.path, TraceError)
-                budget.take(_ROW_BYTES * len(recording))
+                budget.take((_ROW_BYTES + 8 * len(recording.stages)) * len(recording))
                 parts.append(recording)
         if not parts:
             raise TraceError(f"{self.path}: the trace is empty")
@@ -369,7 +378,8 @@ class _StoredRecordings:
 
     def _rows(self) -> Iterator[Rows]:
         with self._opened() as file:
-            present = [name for name in COLUMN_TYPES if name in file.schema_arrow.names]
+            there = file.schema_arrow.names
+            present = [name for name in there if name in COLUMN_TYPES or is_optional(name)]
             groups = [file.metadata.row_group(g) for g in range(file.num_row_groups)]
             if sum(group.num_rows for group in groups) != file.metadata.num_rows:
                 raise TraceError(f"{self.path}: the file is damaged: its row counts disagree")
@@ -430,15 +440,15 @@ def _listed(missing: Iterable[str], known: Iterable[str] = ()) -> str:
 def _joined(parts: list[Recording]) -> Recording:
     if len(parts) == 1:
         return parts[0]
+    names = {name for part in parts for name in part.columns}
+    said = {name: Nullable.of_recordings(name, parts).values for name in names}
     return Recording(
         parts[0].name,
         np.concatenate([part.truth for part in parts]),
         np.concatenate([part.boxes for part in parts]),
         np.concatenate([part.elapsed_ns for part in parts]),
         np.concatenate([part.score for part in parts]),
-        **{
-            name: Nullable.of_recordings(name, parts).values
-            for name in OPTIONAL_COLUMNS
-            if any(name in part.columns for part in parts)
-        },
+        said.pop("arrival_ns", None),
+        said.pop("visible", None),
+        {str(stage_of(name)): values for name, values in said.items()},
     )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sized
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.engine.scheduler import Schedule
 from lae_sim.errors import LaeError
+from lae_sim.trackers.stages import STAGE_NAME, checked_stage
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -31,6 +33,8 @@ class Recording:
             at the world's frame rate.
         visible: False where the annotators say that the target is absent or fully covered, bool
             [T]; None = they say nothing.
+        stages: parts of the processing times in ns by the name of the stage, such as
+            ``"inference"``, int64 [T] each; -1 = unknown, as where the frame was not processed.
 
     Example:
         >>> import lae_sim
@@ -48,6 +52,7 @@ class Recording:
     score: npt.NDArray[np.float32]
     arrival_ns: Ints | None = None
     visible: Bools | None = None
+    stages: Mapping[str, Ints] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Number of world frames T."""
@@ -65,12 +70,14 @@ class Recording:
         columns |= dict(zip(("truth_x", "truth_y", "truth_w", "truth_h"), self.truth.T))
         columns |= dict(zip(("x", "y", "w", "h"), self.boxes.T))
         columns |= {"elapsed_ns": self.elapsed_ns, "score": self.score}
-        return pd.DataFrame(columns | {name: getattr(self, name) for name in self.columns})
+        return pd.DataFrame(columns | self.columns)
 
     @property
-    def columns(self) -> tuple[str, ...]:
-        """Those of :data:`OPTIONAL_COLUMNS` that it has."""
-        return tuple(name for name in OPTIONAL_COLUMNS if getattr(self, name) is not None)
+    def columns(self) -> dict[str, npt.NDArray[Any]]:
+        """What it has of a trace's optional columns, by their names."""
+        found = {name: getattr(self, name) for name in OPTIONAL_COLUMNS}
+        found |= {stage_column(name): self.stages[name] for name in in_order(self.stages)}
+        return {name: values for name, values in found.items() if values is not None}
 
     @classmethod
     def new(
@@ -82,11 +89,13 @@ class Recording:
         score: npt.ArrayLike | None = None,
         arrival_ns: npt.ArrayLike | None = None,
         visible: npt.ArrayLike | None = None,
+        stages: Mapping[str, npt.ArrayLike] | None = None,
     ) -> Recording:
         """A recording from anything array-like (not copied); what is optional defaults to none.
 
         Raises:
-            LaeError: if the lengths differ, or something is not made of numbers.
+            LaeError: if the lengths differ, something is not made of numbers, or a stage has no
+                name of small letters, digits and underscores.
         """
         try:
             times = _whole(elapsed_ns, f"{name}: elapsed_ns")
@@ -99,14 +108,18 @@ class Recording:
                 no_score if score is None else np.asarray(score, np.float32),
                 None if arrival_ns is None else _whole(arrival_ns, f"{name}: arrival_ns"),
                 None if visible is None else _flags(visible, f"{name}: visible"),
+                {
+                    stage: _whole(ns, f"{name}: {stage_column(stage)}")
+                    for stage, ns in (stages or {}).items()
+                },
             )
         except (TypeError, ValueError) as error:
             raise LaeError(f"{name}: not boxes [T, 4] and times in ns [T]: {error}") from error
-        per_frame = ["truth", "boxes", "elapsed_ns", "score", *recording.columns]
-        lengths = {len(getattr(recording, each)) for each in per_frame}
+        names = ("truth", "boxes", "elapsed_ns", "score")
+        known = {each: getattr(recording, each) for each in names} | recording.columns
+        lengths = {len(values) for values in known.values()}
         if len(lengths) != 1:
-            what = ", ".join(per_frame)
-            raise LaeError(f"{name}: differ in length: {what}: {sorted(lengths)}")
+            raise LaeError(f"{name}: differ in length: {', '.join(known)}: {sorted(lengths)}")
         return recording
 
     @classmethod
@@ -144,6 +157,35 @@ class Recording:
 OPTIONAL_COLUMNS: Mapping[str, type[np.generic]] = {"arrival_ns": np.int64, "visible": np.bool_}
 """What a recording may have besides, by the names of its attributes and of a trace's columns."""
 
+STAGES = ("decode", "preprocess", "inference", "postprocess")
+"""The usual stages of a call, in their order; a pipeline may have others."""
+
+
+def stage_column(stage: str) -> str:
+    """The name of the column of a stage.
+
+    Raises:
+        LaeError: if that is no name of a stage.
+    """
+    return f"stage_{checked_stage(stage)}_ns"
+
+
+def stage_of(column: str) -> str | None:
+    """The stage whose times a column has; None of another column."""
+    found = _STAGE_COLUMN.fullmatch(column)
+    return None if found is None else found[1]
+
+
+def is_optional(column: str) -> bool:
+    """Whether a trace need not have a column that recordings may have."""
+    return column in OPTIONAL_COLUMNS or stage_of(column) is not None
+
+
+def in_order(stages: Iterable[str]) -> list[str]:
+    """Names of stages: the usual ones in their order, then others by name."""
+    places = {name: place for place, name in enumerate(STAGES)}
+    return sorted(stages, key=lambda name: (places.get(name, len(places)), name))
+
 
 def _whole(values: npt.ArrayLike, what: str) -> Ints:
     with np.errstate(invalid="ignore"):
@@ -159,6 +201,8 @@ def _flags(values: npt.ArrayLike, what: str) -> Bools:
         raise LaeError(f"{what}: a flag is True or False, not of type {flags.dtype}")
     return flags
 
+
+_STAGE_COLUMN = re.compile(f"stage_({STAGE_NAME.pattern})_ns")
 
 BATCH_ROWS = 1 << 15
 

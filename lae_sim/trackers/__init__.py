@@ -8,5 +8,6 @@ What users' own trackers call is here.
 """
 
 from lae_sim.trackers.onnx import onnx_session
+from lae_sim.trackers.stages import stage
 
-__all__ = ["onnx_session"]
+__all__ = ["onnx_session", "stage"]

@@ -23,6 +23,7 @@ import numpy as np
 
 from lae_sim.errors import LaeError
 from lae_sim.trackers.protocol import Array, Image, checked_box, checked_frame, checked_search
+from lae_sim.trackers.stages import stage
 
 CELLS = 32  # of the search window, whose side is CELL * CELLS pixels whatever the target's size
 SCALE_SIDE = 32  # pixels of a patch of the scale filter
@@ -100,8 +101,9 @@ class Dcf:
         self._mask = self._to(np.outer(rows, columns).astype(np.float32))
         self._started = False
         self._scale_filter = self._scale_energy = np.zeros(1, np.float32)
-        self._learn(frame)
-        self._rescale(frame)
+        with stage("learn"):
+            self._learn(frame)
+            self._rescale(frame)
         self._started = True
 
     def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
@@ -122,14 +124,16 @@ class Dcf:
         if not self._started:
             raise LaeError("dcf: init must come before track")
         self._keep_inside(frame)
-        response = (self._filter.conj() * self._channels(frame)).sum(0)
-        shift, psr = _peak(response.cpu().numpy() if self._torch else response)
+        with stage("inference"):
+            response = (self._filter.conj() * self._channels(frame)).sum(0)
+            shift, psr = _peak(response.cpu().numpy() if self._torch else response)
         if psr >= self._min_psr * self._mean_psr:
             self._mean_psr += PSR_RATE * (psr - self._mean_psr) if self._mean_psr else psr
             self._centre += shift * self._side() / CELLS
             self._keep_inside(frame)
-            self._rescale(frame)
-            self._learn(frame)
+            with stage("learn"):
+                self._rescale(frame)
+                self._learn(frame)
         (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
         return (cx - w / 2, cy - h / 2, w, h), psr
 
@@ -162,7 +166,8 @@ class Dcf:
     def _channels(self, frame: Image) -> Any:
         """Fourier transform of the search window's channels, complex64 [C, CELLS, CELLS/2 + 1]."""
         side = self._side()
-        channels = features(crop(frame, self._centre, (side, side), CELLS * CELL))
+        with stage("preprocess"):
+            channels = features(crop(frame, self._centre, (side, side), CELLS * CELL))
         channels -= channels.mean((1, 2), keepdims=True)
         return self._fft.rfft2(self._to(channels * self._window))
 
@@ -197,8 +202,9 @@ class Dcf:
 
     def _scale_features(self, frame: Image) -> Array:
         """Fourier transform over the scales of the target's features, complex64 [S/2 + 1, F]."""
-        patches = [crop(frame, self._centre, self._size * s, SCALE_SIDE) for s in self._steps]
-        found = features(np.concatenate(patches))  # one call, since each has a cost of its own
+        with stage("preprocess"):
+            patches = [crop(frame, self._centre, self._size * s, SCALE_SIDE) for s in self._steps]
+            found = features(np.concatenate(patches))  # one call, since each has a cost of its own
         rows = found.reshape(len(found), len(patches), -1).swapaxes(0, 1).reshape(len(patches), -1)
         return np.fft.rfft(rows * self._scale_window, axis=0).astype(np.complex64)
 

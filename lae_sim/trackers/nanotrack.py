@@ -26,6 +26,7 @@ from lae_sim.trackers.protocol import (
     checked_search,
     weights_digest,
 )
+from lae_sim.trackers.stages import stage
 
 TEMPLATE, SEARCH, STRIDE = 127, 255, 16  # pixels of the two inputs, and of a step of the output
 CONTEXT = 0.5
@@ -40,9 +41,9 @@ _NO_DEVICE = "nanotrack: the device {!r} is neither 'cpu' nor 'cuda:NUMBER'"
 _PROVIDERS = {"": "CPU", "cpu": "CPU", "cuda": "CUDA"}  # of ONNX Runtime, for a kind of device
 
 if TYPE_CHECKING:
-    # features of a patch; and of those of template and patch, classes [1, 2, n, n] and sides
-    # [1, 4, n, n]
-    Networks = tuple[Callable[[Image], Array], Callable[[Array, Array], Sequence[Array]]]
+    # features of a patch [1, 3, side, side]; and of those of template and patch, classes
+    # [1, 2, n, n] and sides [1, 4, n, n]
+    Networks = tuple[Callable[[Array], Array], Callable[[Array, Array], Sequence[Array]]]
 
 _UPSTREAM = "they are in NanoTrack/models of https://github.com/HonglinChu/SiamTrackers"
 
@@ -85,11 +86,11 @@ class NanoTrack:
         try:
             if runtime == "opencv":
                 self._settings["device"] = device or "cpu"
-                self._features, self._head = _opencv(paths, device or "cpu")
+                self._backbone, self._head = _opencv(paths, device or "cpu")
             else:
                 usual, number = _gpu(device)
                 self._settings["provider"] = provider = provider or usual
-                self._features, self._head = _onnx(
+                self._backbone, self._head = _onnx(
                     paths, provider=provider, device=number, cpu_nodes=cpu_nodes, cache=cache
                 )
             self._template = self._features(np.zeros((TEMPLATE, TEMPLATE, 3), np.uint8))
@@ -116,8 +117,9 @@ class NanoTrack:
         x, y, w, h = checked_box(box)
         self._centre, self._size = np.array([x + w / 2, y + h / 2]), np.array([w, h])
         self._mean = cv2.mean(frame)
-        side = round(self._context_side())
-        self._template = self._features(self._crop(frame, side, TEMPLATE))
+        with stage("preprocess"):
+            patch = self._crop(frame, round(self._context_side()), TEMPLATE)
+        self._template = self._features(patch)
         self._started = True
 
     def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
@@ -138,32 +140,34 @@ class NanoTrack:
         if not self._started:
             raise LaeError("nanotrack: init must come before track")
         edge = np.array(frame.shape[1::-1], float)
-        self._centre, self._size = np.clip(self._centre, 0, edge), np.minimum(self._size, edge)
-        zoom = TEMPLATE / self._context_side()
-        patch = self._crop(frame, round(SEARCH / zoom), SEARCH)
+        with stage("preprocess"):
+            self._centre, self._size = np.clip(self._centre, 0, edge), np.minimum(self._size, edge)
+            zoom = TEMPLATE / self._context_side()
+            patch = self._crop(frame, round(SEARCH / zoom), SEARCH)
         scores, sides = self._correlate(patch)
-        left, top, right, bottom = sides.astype(np.float64)
-        width, height = np.maximum(left + right, 1e-3), np.maximum(top + bottom, 1e-3)
-        # the penalty of SiamRPN on changes of shape and of size
-        w, h = self._size * zoom
-        shape, size = (width / height) / (w / h), _overall(width, height) / _overall(w, h)
-        change = np.maximum(shape, 1 / shape) * np.maximum(size, 1 / size)
-        penalty = np.exp(self._penalty * (1 - change))
-        wanted = penalty * scores * (1 - self._influence) + self._window * self._influence
-        best = np.unravel_index(int(wanted.argmax()), wanted.shape)
-        row, column = best
-        offset = np.array(
-            [
-                self._points[column] + (right[best] - left[best]) / 2,
-                self._points[row] + (bottom[best] - top[best]) / 2,
-            ]
-        )
-        rate = penalty[best] * scores[best] * self._rate
-        target_size = np.array([width[best], height[best]]) / zoom
-        self._centre = np.clip(self._centre + offset / zoom, 0, edge)
-        size = (1 - rate) * self._size + rate * target_size
-        self._size = np.clip(size, SMALLEST, np.maximum(edge, SMALLEST))
-        (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
+        with stage("postprocess"):
+            left, top, right, bottom = sides.astype(np.float64)
+            width, height = np.maximum(left + right, 1e-3), np.maximum(top + bottom, 1e-3)
+            # the penalty of SiamRPN on changes of shape and of size
+            w, h = self._size * zoom
+            shape, size = (width / height) / (w / h), _overall(width, height) / _overall(w, h)
+            change = np.maximum(shape, 1 / shape) * np.maximum(size, 1 / size)
+            penalty = np.exp(self._penalty * (1 - change))
+            wanted = penalty * scores * (1 - self._influence) + self._window * self._influence
+            best = np.unravel_index(int(wanted.argmax()), wanted.shape)
+            row, column = best
+            offset = np.array(
+                [
+                    self._points[column] + (right[best] - left[best]) / 2,
+                    self._points[row] + (bottom[best] - top[best]) / 2,
+                ]
+            )
+            rate = penalty[best] * scores[best] * self._rate
+            target_size = np.array([width[best], height[best]]) / zoom
+            self._centre = np.clip(self._centre + offset / zoom, 0, edge)
+            size = (1 - rate) * self._size + rate * target_size
+            self._size = np.clip(size, SMALLEST, np.maximum(edge, SMALLEST))
+            (cx, cy), (w, h) = self._centre.tolist(), self._size.tolist()
         return (cx - w / 2, cy - h / 2, w, h), float(scores[best])
 
     def describe(self) -> dict[str, Any]:
@@ -201,11 +205,20 @@ class NanoTrack:
         patch = cv2.warpAffine(frame, matrix, (pixels, pixels), borderValue=self._mean)
         return np.asarray(patch, np.uint8)
 
+    def _features(self, patch: Image) -> Array:
+        with stage("preprocess"):
+            blob = cv2.dnn.blobFromImage(patch)
+        with stage("inference"):
+            return self._backbone(blob)
+
     def _correlate(self, patch: Image) -> tuple[Array, Array]:
         """Probability [n, n], and distances left, top, right, bottom [4, n, n], pixels of patch."""
-        (classes,), (sides,) = self._head(self._template, self._features(patch))
-        background, target = classes.astype(np.float64)
-        return 1 / (1 + np.exp(np.clip(background - target, -500, 500))), sides
+        features = self._features(patch)
+        with stage("inference"):
+            (classes,), (sides,) = self._head(self._template, features)
+        with stage("postprocess"):
+            background, target = classes.astype(np.float64)
+            return 1 / (1 + np.exp(np.clip(background - target, -500, 500))), sides
 
 
 def _overall(w: Any, h: Any) -> Any:
@@ -234,8 +247,8 @@ def _find(folder: str, part: str, given: str) -> Path:
 def _opencv(paths: Sequence[Path], device: str) -> Networks:
     backbone, head = (_network(path, device) for path in paths)
 
-    def features(patch: Image) -> Array:
-        backbone.setInput(cv2.dnn.blobFromImage(patch))
+    def features(patch: Array) -> Array:
+        backbone.setInput(patch)
         return np.array(backbone.forward(), np.float32)  # its own memory, which it uses again
 
     def correlated(template: Array, search: Array) -> Sequence[Array]:
@@ -254,9 +267,8 @@ def _onnx(paths: Sequence[Path], **options: Any) -> Networks:
     backbones = {side: onnx_session(paths[0], shapes=shapes[side], **options) for side in sides}
     head = onnx_session(paths[1], **options)
 
-    def features(patch: Image) -> Array:
-        blob = cv2.dnn.blobFromImage(patch)
-        found: Sequence[Array] = backbones[len(patch)].run(None, {"input": blob})
+    def features(patch: Array) -> Array:
+        found: Sequence[Array] = backbones[patch.shape[-1]].run(None, {"input": patch})
         return found[0]
 
     def correlated(template: Array, search: Array) -> Sequence[Array]:

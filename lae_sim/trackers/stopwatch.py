@@ -14,6 +14,7 @@ from lae_sim.errors import LaeError, shown
 from lae_sim.trackers.names import make_tracker
 from lae_sim.trackers.protocol import Image
 from lae_sim.trackers.runtimes import Runtimes
+from lae_sim.trackers.stages import listening
 
 LARGEST = 1e9
 """The largest number in a box, pixels: what lies beyond is no place in an image."""
@@ -70,10 +71,10 @@ class Stopwatch:
         """Start on a new sequence; what is answered has the fields of `.timed.Answer`."""
         self._started = False
         getattr(self._tracker, "prepare", int)()
-        _, elapsed_ns, cpu_ns = self._timed(self._tracker.init, frame.copy(), box)
+        _, times = self._timed(self._tracker.init, frame.copy(), box)
         self._runtimes.limit()  # for libraries that the tracker imports only now
         self._started = True
-        return {"box": list(box), "score": None, "elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns}
+        return {"box": list(box), "score": None, **times}
 
     def track(self, frame: Image, search: Sequence[float] | None = None) -> dict[str, Any]:
         """Find the target, around ``cx, cy, w, h`` if ``search`` is given."""
@@ -84,10 +85,10 @@ class Stopwatch:
             if not self.sets_search:
                 raise LaeError("the tracker cannot be told where to search: it has no set_search")
             self._tracker.set_search(*search)
-        output, elapsed_ns, cpu_ns = self._timed(self._tracker.track, frame.copy())
+        output, times = self._timed(self._tracker.track, frame.copy())
         box, score = _checked(_plain(output))
         self._started = True
-        return {"box": box, "score": score, "elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns}
+        return {"box": box, "score": score, **times}
 
     def describe(self) -> dict[str, Any]:
         """What the tracker says of itself, and its interpreter and libraries, as JSON values."""
@@ -118,12 +119,15 @@ class Stopwatch:
             return True
         return False if self._runtimes.asynchronous() else None
 
-    def _timed(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, int, int]:
+    def _timed(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, dict[str, Any]]:
+        """What a call returns, and the times of the answer."""
         self._sync()
-        cpu, start = process_time_ns(), perf_counter_ns()
-        output = call(*arguments)
-        self._sync()
-        return output, perf_counter_ns() - start, process_time_ns() - cpu
+        with listening() as marked:
+            cpu, start = process_time_ns(), perf_counter_ns()
+            output = call(*arguments)
+            self._sync()
+            elapsed_ns, cpu_ns = perf_counter_ns() - start, process_time_ns() - cpu
+        return output, {"elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns, "stages": marked.ns}
 
 
 def _torch_on_cuda() -> Any:

@@ -26,6 +26,7 @@ from lae_sim.trace.file import read_trace, validate
 TRACKERS = """
 import os, subprocess, sys, time
 import numpy as np
+from lae_sim.trackers import stage
 
 
 class Bright:
@@ -59,7 +60,8 @@ class Bright:
                 return self.box, 0.5
             return {"nan": [float("nan")] * 4, "none": None}[self.how]
         time.sleep(self.ms / 1000)
-        rows, columns = np.nonzero(frame[:, :, 0] == 200)
+        with stage("look"):
+            rows, columns = np.nonzero(frame[:, :, 0] == 200)
         x, y = columns.min(), rows.min()
         if abs(x - self.box[0]) > self.reach:
             return None
@@ -208,6 +210,8 @@ def test_json_says_the_same(here: Path) -> None:
         "mine-Bright-data.closed-loop-0.5ms.parquet",
         "mine-Bright-data.closed-loop-0.5ms-init-1000ms.parquet",
     ]
+    stages = [set(read_trace(here / trace["trace"])["a"].stages) for trace in report["traces"]]
+    assert stages == [{"look"}, {"look"}, {"look"}, set(), set()]  # of our own times
     slow = read_trace(here / report["traces"][-1]["trace"])["a"]
     assert slow.elapsed_ns[0] == 1_000_000_000
     assert report["traces"][-1]["timing"].startswith("constant 0.5ms, initialisation 1000 ms")
@@ -322,6 +326,9 @@ def test_kill_and_resume(here: Path) -> None:
     assert "tracker 'mine:Bright', not 'mine:Searching'" in err
     profile(*options, "--resume")
     assert [recording.name for recording in read_trace(here / "t.parquet")] == ["a", "bad", "c"]
+    for recording in read_trace(here / "t.parquet"):
+        assert (recording.stages["look"][2:] > 0).all()
+        assert (recording.stages["look"] < recording.elapsed_ns).all()
     assert not kept.parent.exists()
     assert not list(here.glob(".*"))  # what the killed one had locked
     _, err = profile(*options, "--resume")
@@ -482,6 +489,9 @@ def test_a_gap_pass_goes_beside_the_other_passes(here: Path) -> None:
     assert f"{fidelity}\n" in out
     assert "lae-sim show t.gaps.parquet --plot reach.png" in out
     validate(here / "t.gaps.parquet")
+    restart = read_trace(here / "t.gaps.parquet")["a@0+3"]
+    assert restart.elapsed_ns[3] >= restart.stages["look"][3] > 0
+    assert ((restart.stages["look"] >= 0) == (restart.elapsed_ns >= 0))[1:].all()
 
     slow = ("--latency", "constant:47ms", "--json")
     with_gaps, _ = ran(*replay.split()[1:], *slow)

@@ -369,7 +369,7 @@ def test_observers_see_what_is_scored(frames: int, monkeypatch: pytest.MonkeyPat
     more = {"frames": frames, "observers": [seen.append], "observed": observed}
     parts = evaluate_groups(runs, EVERY, FORECASTERS, sigmas, costs=COSTS, **more)  # type: ignore[arg-type]
     found = Evaluation.joined(list(parts))
-    assert [scored.run for scored in seen] == runs
+    assert [scored.run.recording for scored in seen] == [run.recording for run in runs]
     for s, (run, scored) in enumerate(zip(runs, seen)):
         assert set(scored.answers) == set(observed)
         for (name, sigma), one in scored.answers.items():

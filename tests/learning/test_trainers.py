@@ -15,8 +15,8 @@ from lae_sim.errors import LaeError
 from lae_sim.forecast.base import Hold, forecast
 from lae_sim.forecast.kalman import PAPER, TunedKalman
 from lae_sim.forecast.learned import Learned
-from lae_sim.learning.folds import Examples, Trainer
-from lae_sim.learning.trainers import KalmanTrainer, NetworkTrainer
+from lae_sim.learning.folds import Examples, Trainer, fit_folds
+from lae_sim.learning.trainers import KalmanTrainer, NetworkTrainer, WrappedTrainer
 from lae_sim.replay.latency import constant
 from lae_sim.replay.run import replay_sequence
 from lae_sim.trace.recording import Recording
@@ -161,3 +161,35 @@ def test_no_other_value_of_one_parameter_is_better() -> None:
     for decay in trainer.decay:
         assert score(TunedKalman(found.q, decay=decay, state=found.state), examples) <= best + 1e-12
     assert isinstance(trainer, Trainer)
+
+
+def test_folds_at_once_find_what_each_fold_finds_alone_and_filter_once_for_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    parts = [simulated(q, 0.9, seed, 60) for seed, q in enumerate((0.03, 30.0, 0.1, 10.0))]
+    examples, held_out = examples_of(parts), [{"s0", "s2"}, {"s1"}, {"s3"}, set()]
+    trainer = KalmanTrainer(q=(0.1, 1.0, 10.0))
+    alone = [trainer.fit(examples.without(names), 0) for names in held_out]
+    assert len(set(alone)) > 1
+    asked: list[TunedKalman] = []
+    forecast_lanes = TunedKalman.forecast_lanes
+
+    def counted(self: TunedKalman, *arguments: Any) -> Any:
+        asked.append(self)
+        return forecast_lanes(self, *arguments)
+
+    monkeypatch.setattr(TunedKalman, "forecast_lanes", counted)
+    told: list[None] = []
+    wrapped = WrappedTrainer(trainer, lambda base: [base])  # type: ignore[arg-type, return-value]
+    found = fit_folds(wrapped, examples, held_out, 0, lambda: told.append(None))
+    assert found == [[each] for each in alone]
+    assert len(told) == len(held_out)
+    assert len(asked) == len(set(asked))
+
+
+def test_a_fold_without_a_truth_is_said() -> None:
+    blind = Recording.new("b", np.full((60, 4), np.nan), moving(60, 1).boxes, [1] * 60)
+    examples = examples_of([moving(60, 1, "a"), blind])
+    assert KalmanTrainer().fit(examples) == KalmanTrainer().fit(examples.without("b"))
+    with pytest.raises(LaeError, match="nothing to learn from"):
+        fit_folds(KalmanTrainer(), examples, [{"b"}, {"a"}], 0)

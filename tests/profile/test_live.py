@@ -14,6 +14,7 @@ import pytest
 from fakes import FakeTimed, bright_frame, bright_sequence
 from hypothesis import given
 from hypothesis import strategies as st
+from witness import same
 
 from lae_sim.boxes import search_region
 from lae_sim.datasets.frames import ImageSequence
@@ -54,10 +55,7 @@ def assert_equal(found: Run, run: LiveRun) -> None:
     assert found.departures == 0
     np.testing.assert_array_equal(found.schedule.frames, run.frames)
     np.testing.assert_array_equal(found.schedule.elapsed_ns, run.recording.elapsed_ns[run.frames])
-    for column in ("truth", "boxes", "elapsed_ns", "score"):
-        np.testing.assert_array_equal(
-            getattr(found.recording, column), getattr(run.recording, column)
-        )
+    assert same(found.recording, run.recording)
     np.testing.assert_array_equal(found.boxes, run.recording.boxes[run.frames])
 
 
@@ -68,18 +66,34 @@ POLICIES = st.one_of(
 )
 
 
+STAGES = st.lists(
+    st.dictionaries(
+        st.sampled_from(["preprocess", "inference", "learn"]),
+        st.fractions(0, Fraction(1, 3), max_denominator=9),
+    ),
+    min_size=1,
+    max_size=4,
+)
+"""Shares of the calls' times that are stages'."""
+
+
 @given(
     times=st.lists(st.integers(1, 5 * FRAME_NS), min_size=1, max_size=9),
     policy=POLICIES,
     fps=st.sampled_from([Fraction(30), Fraction(30000, 1001), Fraction(7)]),
     pre_forecaster=st.sampled_from([None, Kalman, ConstantVelocity]),
+    stages=STAGES,
 )
 def test_a_replay_equals_the_profile_to_the_bit(
-    times: list[int], policy: Policy, fps: Fraction, pre_forecaster: type | None
+    times: list[int],
+    policy: Policy,
+    fps: Fraction,
+    pre_forecaster: type | None,
+    stages: list[dict[str, Fraction]],
 ) -> None:
     run = run_real_time(
         bright_sequence(PATH),
-        FakeTimed(times),
+        FakeTimed(times, stages=stages),
         Clock.at(fps),
         policy,
         pre_forecaster=pre_forecaster,
@@ -89,21 +103,30 @@ def test_a_replay_equals_the_profile_to_the_bit(
 
 
 @given(
-    times=st.lists(st.integers(0, 3 * FRAME_NS), min_size=1, max_size=9), stride=st.integers(1, 6)
+    times=st.lists(st.integers(0, 3 * FRAME_NS), min_size=1, max_size=9),
+    stride=st.integers(1, 6),
+    stages=STAGES,
 )
 def test_a_strided_pass_sees_each_frame_after_the_one_a_stride_before(
-    times: list[int], stride: int
+    times: list[int], stride: int, stages: list[dict[str, Fraction]]
 ) -> None:
     sequence = bright_sequence(PATH)
-    strided = run_every_frame(sequence, FakeTimed(times), Fraction(stride))
+    strided = run_every_frame(sequence, FakeTimed(times, stages=stages), Fraction(stride))
     assert not np.isnan(strided.recording.boxes).any()
     assert (strided.recording.elapsed_ns >= 0).all()
     for first in range(1, stride + 1):
         slow_world = Clock.at(Fraction(1, 9))
         alone = run_real_time(
-            sequence, FakeTimed(times), slow_world, listed([0, *range(first, len(PATH), stride)])
+            sequence,
+            FakeTimed(times, stages=stages),
+            slow_world,
+            listed([0, *range(first, len(PATH), stride)]),
         )
         frames = alone.frames
+        for name, ns in strided.recording.stages.items():
+            known = alone.recording.stages.get(name, np.full(len(PATH), -1))
+            np.testing.assert_array_equal(ns[frames[1:]], known[frames[1:]])
+        assert alone.recording.stages.keys() <= strided.recording.stages.keys()
         np.testing.assert_array_equal(
             strided.recording.boxes[frames], alone.recording.boxes[frames]
         )
@@ -131,6 +154,15 @@ def test_another_devices_times_drive_the_schedule_and_fill_the_trace() -> None:
     assert run.frames.tolist() == list(range(0, 30, 3))
     assert set(run.recording.elapsed_ns[run.frames].tolist()) == {100_000_000}
     assert set(run.measured_ns.tolist()) == {7}
+
+
+def test_of_another_devices_times_no_parts_are_known() -> None:
+    staged = FakeTimed([9], stages=[{"inference": Fraction(1, 3)}])
+    for service, expected in ((None, {"inference", "decode"}), (lambda frame: 100_000_000, set())):
+        run = run_real_time(
+            bright_sequence(PATH), staged, CLOCK, latest, service=service, include_decode=True
+        )
+        assert run.recording.stages.keys() == expected
 
 
 def test_the_pre_forecaster_sets_the_search_before_each_frame() -> None:
@@ -238,6 +270,15 @@ def test_decoding_counts_if_asked_for() -> None:
     run = run_real_time(sequence, FakeTimed([5]), CLOCK, include_decode=True)
     assert (run.recording.elapsed_ns > 5).all()
     assert set(run.measured_ns.tolist()) == {5}
+    assert (run.recording.stages["decode"] == run.recording.elapsed_ns - 5).all()
+
+
+def test_what_a_tracker_decodes_itself_is_decoding_too() -> None:
+    staged = FakeTimed([9], stages=[{"decode": Fraction(1, 3)}])
+    run = run_real_time(bright_sequence(PATH), staged, CLOCK, include_decode=True)
+    assert (run.recording.stages["decode"] == run.recording.elapsed_ns - 9 + 3).all()
+    alone = run_real_time(bright_sequence(PATH), staged, CLOCK)
+    assert set(alone.recording.stages["decode"].tolist()) == {3}
 
 
 @pytest.mark.parametrize(

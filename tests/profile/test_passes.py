@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,41 @@ def test_a_resumed_pass_is_one_trace_of_both_runs(tmp_path: Path) -> None:
     document = trace.metadata.document
     assert document["sequences"]["b"]["order"] == 1
     assert document["device"]["readings"]["before"] == {"time": "1"}
+
+
+def test_a_call_that_enters_some_stages_spent_no_time_in_the_others(tmp_path: Path) -> None:
+    third = Fraction(1, 3)
+    both = [{}, {"inference": third, "learn": third}, {"inference": third}, {}]
+    of_runs = {"a": both, "b": [{}, {"inference": third}], "c": [{}], "d": [{"learn": third}, {}]}
+    folder = tmp_path / "t.unfinished"
+    for name, stages in of_runs.items():  # each by a process of its own
+        tracker = FakeTimed([9], stages=stages)
+        task, journal = a_pass(tmp_path, tracker), Journal(folder, {}, resume=name != "a")
+        ran(task, tracker, journal, name)
+    write_pass(task, journal, [])
+    found = {r.name: {k: ns.tolist() for k, ns in r.stages.items()} for r in read_trace(task.path)}
+    assert found == {
+        "a": {"inference": [-1, 3, 3, -1, -1, 3], "learn": [-1, 3, 0, -1, -1, 3]},
+        "b": {"inference": [-1, 3, -1, 3, -1, 3], "learn": [-1, 0, -1, 0, -1, 0]},
+        "c": {},
+        "d": {"inference": [0, -1, 0, -1, 0, -1], "learn": [3, -1, 3, -1, 3, -1]},
+    }
+    assert read_trace(task.path).metadata.document["version"] == "1.1"
+
+
+def test_the_decoding_is_not_one_that_a_tracker_enters(tmp_path: Path) -> None:
+    tracker = FakeTimed([9], stages=[{}, {"learn": Fraction(1, 3)}, {}])
+
+    def run(sequence: ImageSequence, **more: Any) -> list[LiveRun]:
+        return [run_every_frame(sequence, tracker, include_decode=True, **more)]
+
+    task = replace(a_pass(tmp_path, tracker), run=run)
+    journal = Journal(tmp_path / "t.unfinished", {}, resume=False)
+    ran(task, tracker, journal, "a")
+    write_pass(task, journal, [])
+    (recording,) = read_trace(task.path)
+    assert recording.stages["learn"].tolist() == [-1, 3, -1, -1, 3, -1]
+    assert (recording.stages["decode"] == recording.elapsed_ns - 9).all()
 
 
 def test_a_damaged_part_is_run_again(tmp_path: Path) -> None:

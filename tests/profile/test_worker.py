@@ -212,6 +212,32 @@ def test_set_search_and_the_first_sync_are_not_measured(start: Any) -> None:
     assert 10e6 <= min(times) < 20e6  # sync takes 10 ms, set_search 50 ms
 
 
+def test_stages_that_a_tracker_marks_are_parts_of_its_time(
+    make: Callable[..., TimedTracker],
+) -> None:
+    tracker = make("misbehaving:Staged")
+    assert tracker.init(FRAME, BOX).stages == {}
+    for _ in range(2):  # in which nothing is left of the call before
+        answer = tracker.track(FRAME)
+        assert answer.stages.keys() == {"preprocess", "inference"}
+        assert 0.01e9 <= answer.stages["preprocess"] < answer.elapsed_ns - 0.02e9
+        assert answer.stages["inference"] >= 0.02e9
+        assert sum(answer.stages.values()) <= answer.elapsed_ns
+    with pytest.raises(TrackerError, match="lost my mind"):
+        tracker.track(FRAME)
+    assert tracker.init(FRAME, BOX).stages == {}
+    assert tracker.track(FRAME).stages["inference"] >= 0.02e9
+    tracker.close()
+
+
+def test_a_stage_that_no_trace_can_name_is_an_error(make: Callable[..., TimedTracker]) -> None:
+    tracker = make("misbehaving:Misnamed")
+    tracker.init(FRAME, BOX)
+    with pytest.raises(TrackerError, match="'Pre-process' is no name of a stage: small letters"):
+        tracker.track(FRAME)
+    tracker.close()
+
+
 def test_a_tracker_without_set_search_cannot_be_told(make: Callable[..., TimedTracker]) -> None:
     tracker = make()
     tracker.init(FRAME, BOX)

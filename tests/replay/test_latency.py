@@ -6,6 +6,7 @@ import hashlib
 import math
 import statistics
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from statistics import NormalDist
@@ -22,6 +23,7 @@ from lae_sim.errors import LaeError
 from lae_sim.replay.latency import (
     LatencySource,
     RandomSource,
+    StageTimes,
     bootstrap,
     by_call,
     by_frame,
@@ -32,7 +34,9 @@ from lae_sim.replay.latency import (
     scaled,
 )
 from lae_sim.replay.run import replay_sequence
-from lae_sim.replay.world import label_of
+from lae_sim.replay.world import World, label_of, parse_latency, replay_trace
+from lae_sim.trace.file import Trace
+from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
 TIMES = [90, -1, 20, 30, -1, 50]
@@ -59,6 +63,81 @@ def test_by_frame_looks_the_frame_up() -> None:
 def test_by_frame_names_what_is_missing() -> None:
     with pytest.raises(LaeError, match=r"sequence 'Car2', frame 4: .*skipped"):
         by_frame(recording(TIMES, "Car2"))(4)
+
+
+# ---------------------------------------------------------------------------------------- stages
+
+
+def staged(name: str = "a") -> Recording:
+    """90 ns of which nothing is said, a skipped frame, and two stages of the others."""
+    stages = {"inference": [-1, -1, 12, 0, -1, 9], "preprocess": [-1, -1, 5, 7, -1, -1]}
+    known = {stage: np.array(ns) for stage, ns in stages.items()}
+    return replace(recording(TIMES, name), stages=known)
+
+
+def test_the_times_of_stages_alone_add_up() -> None:
+    one = StageTimes(("inference",))(staged())
+    assert [one(frame) for frame in (2, 3, 5)] == [12, 0, 9]
+    both = StageTimes(("preprocess", "inference"))(staged())
+    assert [both(frame) for frame in (2, 3)] == [17, 7]
+    half = scaled(StageTimes(("preprocess", "inference")), Fraction(1, 2))(staged())
+    assert [half(frame) for frame in (2, 3)] == [8, 4]
+
+
+@pytest.mark.parametrize("frame", [0, 1, 5])
+def test_a_frame_without_the_time_of_a_stage_is_named(frame: int) -> None:
+    service = StageTimes(("inference", "preprocess"))(staged("Car2"))
+    message = rf"sequence 'Car2', frame {frame}: .*no time of inference and preprocess for it"
+    with pytest.raises(LaeError, match=message + r".*,init=TIME"):
+        service(frame)
+
+
+def test_the_initialisation_may_be_given_where_it_has_no_stages() -> None:
+    service = initialised(StageTimes(("inference",)), 300)(staged())
+    assert [service(frame) for frame in (0, 2)] == [300, 12]
+
+
+def test_stages_that_a_recording_lacks_are_named_with_those_it_has() -> None:
+    message = r"sequence 'Car2': .*stage 'warp' .column stage_warp_ns.*are preprocess, inference"
+    with pytest.raises(LaeError, match=message):
+        StageTimes(("inference", "warp"))(staged("Car2"))
+    with pytest.raises(LaeError, match=r"'inference'.*of the stages in it there are none"):
+        StageTimes(("inference",))(recording(TIMES))
+
+
+@pytest.mark.parametrize("stages", [(), ("a", "a"), ("",), ("Decode",)])
+def test_stages_are_named_once_each(stages: tuple[str, ...]) -> None:
+    with pytest.raises(LaeError, match=r"name one stage or several|is no name of a stage"):
+        StageTimes(stages)
+
+
+def test_stages_by_name() -> None:
+    assert parse_latency("stage:inference") == StageTimes(("inference",))
+    world = World.of(latency="stage:preprocess+inference,init=1s", scale=2)
+    assert world.label() == "stage:preprocess+inference,init=1s x 2"
+    assert label_of(StageTimes(("a", "b"))) == "stage:a+b"
+    with pytest.raises(LaeError, match=r"latency 'stage:': '' is no name of a stage"):
+        parse_latency("stage:")
+    with pytest.raises(LaeError, match=r"no latency 'stages'.*did you mean 'stage'"):
+        parse_latency("stages")
+
+
+@pytest.mark.parametrize("count", [1, 20])  # one by one, and in lanes
+def test_a_replay_by_a_stage_is_one_of_its_times(count: int) -> None:
+    boxes = np.ones((40, 4))
+    random = np.random.default_rng(count)
+    group, expected = [], []
+    for i in range(count):
+        elapsed = random.integers(10_000_000, 90_000_000, 40)
+        parts = {name: random.integers(0, elapsed // 2) for name in ("decode", "inference")}
+        made = Recording.new(f"s{i:02}", boxes, boxes, elapsed, stages=parts)
+        group.append(made)
+        expected.append(replace(made, elapsed_ns=parts["decode"] + parts["inference"], stages={}))
+    every = Metadata.new("30", "every-frame")
+    found = replay_trace(Trace(every, group), latency="stage:inference+decode")
+    for run, other in zip(found, replay_trace(Trace(every, expected)), strict=True):
+        assert run.schedule.frames.tolist() == other.schedule.frames.tolist()
+        assert run.schedule.ready.tolist() == other.schedule.ready.tolist()
 
 
 def test_by_call_takes_the_recorded_times_in_order_whatever_the_frame() -> None:

@@ -197,9 +197,72 @@ def test_a_fault_in_arrivals_is_named(
         validate(path)
 
 
+@pytest.mark.parametrize("batch", [1 << 16, 7, 1])
+@pytest.mark.parametrize(
+    ("column", "row", "value", "cause"),
+    [
+        ("stage_decode_ns", ROW, -1, "negative time -1 ns"),
+        ("stage_decode_ns", ROW, -(2**63), "negative"),
+        ("stage_inference_ns", ROW, 2**63 - 1, "take longer than it, 20000000 ns"),
+        ("stage_inference_ns", ROW, 20_000_001 - 3_000_000, "take longer than it, 20000000 ns"),
+        ("elapsed_ns", ROW, 10_999_999, "take longer than it, 10999999 ns"),
+    ],
+)
+def test_a_fault_in_stages_is_named(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    batch: int,
+    column: str,
+    row: int,
+    value: int,
+    cause: str,
+) -> None:
+    columns = {
+        **columns_of(GROUP),
+        "elapsed_ns": [20_000_000] * 40,
+        "stage_decode_ns": [3_000_000] * 40,
+        "stage_inference_ns": [None] * 10 + [8_000_000] * 29 + [17_000_000],
+    }
+    validate(write_plain(tmp_path / "faulty.parquet", columns, NEWER))
+    columns[column][row] = value
+    path = write_plain(tmp_path / "faulty.parquet", columns, NEWER)
+    monkeypatch.setattr(lae_sim.trace.file, "BATCH_ROWS", batch)
+    named = "stage_inference_ns" if column == "elapsed_ns" else column
+    where = f"faulty.parquet: column '{named}', sequence 'Gull2', frame 5: "
+    with pytest.raises(TraceError, match=where + ".*" + cause):
+        validate(path)
+
+
+def test_a_frame_that_was_not_processed_has_no_stages(tmp_path: Path) -> None:
+    columns = {**columns_of(GROUP), "stage_warp_ns": [None] * 39 + [0]}
+    unprocessed(ROW)(columns)
+    validate(write_plain(tmp_path / "valid.parquet", columns, NEWER))
+    columns["stage_warp_ns"][ROW] = 0
+    path = write_plain(tmp_path / "faulty.parquet", columns, NEWER)
+    with pytest.raises(TraceError, match=r"'stage_warp_ns', .*frame 5: .*not processed"):
+        validate(path)
+
+
+@pytest.mark.parametrize("name", ["Decode", "decode-2", "2d", "", "_x", "décode", "a b"])
+def test_a_column_that_would_be_a_stages_is_called_so(tmp_path: Path, name: str) -> None:
+    columns = {**columns_of(GROUP), f"stage_{name}_ns": [0] * 40}
+    path = write_plain(tmp_path / "faulty.parquet", columns, NEWER)
+    with pytest.raises(TraceError, match=rf"column 'stage_{name}_ns': '{name}' is no name"):
+        validate(path)
+
+
+def test_other_columns_may_be_called_nearly_so(tmp_path: Path) -> None:
+    more = dict.fromkeys(["stage_ns", "stage_decode_ms", "stages_x_ns", "Stage_x_ns"], ["x"] * 40)
+    path = write_plain(tmp_path / "valid.parquet", {**columns_of(GROUP), **more})
+    assert not read_trace(path).columns
+    validate(path)
+
+
 @pytest.mark.parametrize(
     ("column", "values", "message"),
     [
+        ("stage_warp_ns", [0.001] * 40, "is double, must be int64.*seconds"),
+        ("stage_warp_ns", ["1"] * 40, "is string, must be int64"),
         ("arrival_ns", [i / 30 for i in range(20)] * 2, "is double, must be int64.*seconds"),
         ("visible", [1] * 40, "is int64, must be bool"),
         ("visible", ["yes"] * 40, "is string, must be bool"),

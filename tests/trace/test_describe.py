@@ -28,6 +28,32 @@ def test_a_recording_gives_its_initialisation_and_its_calls() -> None:
     assert (found.frames.tolist(), found.elapsed_ns.tolist()) == ([2, 4], [20, 30])
 
 
+def test_stages_of_the_calls_and_what_is_left() -> None:
+    boxes = np.zeros((5, 4))
+    stages = {
+        "learn": [9, 0, 20, -1, 0],
+        "decode": [9, 10, 10, 10, -1],
+        "inference": [-1, 10, 30, -1, -1],
+    }
+    ns = {
+        name: np.array(times) * np.where(np.array(times) < 0, 1, MS)
+        for name, times in stages.items()
+    }
+    first = Recording.new("a", boxes, boxes, np.array([90, 40, 80, 10, 50]) * MS, stages=ns)
+    other = Recording.new("b", boxes, boxes, np.array([90, 40, -1, -1, -1]))
+    found = timing.stage_times([SequenceTimes.of(r) for r in (first, other)])
+    shown = [(row["stage"], row["n"], row["median_ms"], row["share"]) for row in found]
+    assert shown == [
+        ("decode", 3, 10, pytest.approx(30 / 130)),
+        ("inference", 2, 20, pytest.approx(40 / 120)),
+        ("learn", 3, 0, pytest.approx(20 / 170)),
+        (None, 4, 20, pytest.approx((20 + 20 + 0 + 50) / 180)),
+    ]
+    assert found[1]["p95_ms"] == pytest.approx(29)
+    assert found[1]["mean_ms"] == 20
+    assert timing.stage_times([SequenceTimes.of(other)]) == []
+
+
 def test_the_summary() -> None:
     found = timing.summary(np.arange(1, 101) * MS)
     assert found["n"] == 100

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from lae_sim.errors import LaeError, TraceError
 from lae_sim.trace.file import Trace, read_trace, validate, write_trace
 from lae_sim.trace.locate import digest
 from lae_sim.trace.metadata import Metadata
-from lae_sim.trace.recording import Recording, batched
+from lae_sim.trace.recording import STAGES, Recording, batched
 
 EVERY = Metadata.new("30", "every-frame")
 
@@ -139,6 +139,17 @@ def flagged(recording: Recording, seed: int = 0) -> Recording:
     return replace(recording, visible=np.random.default_rng(seed).random(len(recording)) < 0.7)
 
 
+def staged(recording: Recording, names: Sequence[str] = STAGES, seed: int = 0) -> Recording:
+    """With times of stages of most of the processed frames, of at least one of them each."""
+    random, stages = np.random.default_rng(seed), {}
+    for name in names:
+        ns = random.integers(0, np.maximum(recording.elapsed_ns, 0) // len(names) + 1)
+        unknown = (recording.elapsed_ns < 0) | (random.random(len(recording)) < 0.3)
+        unknown[0] = False
+        stages[name] = np.where(unknown, -1, ns)
+    return replace(recording, stages=stages)
+
+
 def columns_in(path: Path) -> set[str]:
     return set(pq.read_schema(path).names) - TYPES.keys()
 
@@ -148,21 +159,27 @@ def version_in(path: Path) -> Any:
 
 
 @given(
-    kinds=st.lists(st.tuples(st.integers(1, 30), st.booleans()), min_size=1, max_size=5),
+    kinds=st.lists(
+        st.tuples(
+            st.integers(1, 30), st.booleans(), st.lists(st.sampled_from(STAGES), unique=True)
+        ),
+        min_size=1,
+        max_size=5,
+    ),
     arrives=st.booleans(),
     batch=st.integers(1, 40),
 )
 @settings(max_examples=40)
 def test_optional_columns_come_back(
     tmp_path_factory: pytest.TempPathFactory,
-    kinds: list[tuple[int, bool]],
+    kinds: list[tuple[int, bool, list[str]]],
     arrives: bool,
     batch: int,
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "optional.parquet"
     group = []
-    for i, (length, says) in enumerate(kinds):
-        recording = sparse(length, i, f"s{i}")
+    for i, (length, says, stages) in enumerate(kinds):
+        recording = staged(sparse(length, i, f"s{i}"), stages, i)
         recording = arriving(recording, i) if arrives else recording
         group.append(flagged(recording, i) if says else recording)
     with pytest.MonkeyPatch.context() as patch:
@@ -171,8 +188,9 @@ def test_optional_columns_come_back(
         assert_same(read_trace(path), group)
         held_back = read_trace(path, group[-1].name)
         assert_same(held_back, group[-1:])
-    has = {"arrival_ns": arrives, "visible": any(says for _, says in kinds)}
+    has = {"arrival_ns": arrives, "visible": any(says for _, says, _ in kinds)}
     expected = {name for name in has if has[name]}
+    expected |= {f"stage_{stage}_ns" for _, _, stages in kinds for stage in stages}
     assert columns_in(path) == expected
     assert version_in(path) == ("1.1" if expected else "1.0")
     assert set(read_trace(path).columns) == expected
@@ -194,6 +212,38 @@ def test_a_frame_of_which_nothing_is_said_counts_as_visible(path: Path) -> None:
     assert a.visible is not None
     assert a.visible.tolist() == [True, False, True, True]
     assert b.visible is None
+
+
+def test_the_columns_of_stages_are_in_their_order_and_encoded_as_suggested(path: Path) -> None:
+    group = [staged(moving(9, 0, "a"), ["warp", "postprocess"]), staged(moving(9, 1, "b"))]
+    write_trace(Trace(EVERY, group), path)
+    file = pq.ParquetFile(path)
+    columns = [f"stage_{name}_ns" for name in (*STAGES, "warp")]
+    assert file.schema_arrow.names[-5:] == columns
+    assert {file.schema_arrow.field(name).type for name in columns} == {pa.int64()}
+    group_of_rows = file.metadata.row_group(0)
+    for i in range(group_of_rows.num_columns):
+        column = group_of_rows.column(i)
+        if column.path_in_schema in columns:
+            assert "DELTA_BINARY_PACKED" in column.encodings
+
+
+def test_what_nobody_says_of_a_stage_is_unknown(path: Path) -> None:
+    columns = columns_of([moving(3, 0, "a"), moving(2, 0, "b")])
+    columns["stage_own_2_ns"] = [None, 0, 7, None, None]
+    write_plain(path, columns, {**MINIMAL, "version": "1.1"})
+    a, b = read_trace(path)
+    assert {name: ns.tolist() for name, ns in a.stages.items()} == {"own_2": [-1, 0, 7]}
+    assert b.stages == {}
+    assert read_trace(path).to_frame()["stage_own_2_ns"].tolist()[:3] == [-1, 0, 7]
+
+
+def test_readers_of_version_1_0_read_the_rest(path: Path) -> None:
+    """A reader of version 1.0 takes the columns that it knows by name."""
+    group = [staged(sparse(30, 1, "a")), sparse(3, 2, "b")]
+    write_trace(Trace(EVERY, group), path)
+    pq.write_table(pq.read_table(path, columns=list(TYPES)), path)
+    assert_same(read_trace(path), [replace(recording, stages={}) for recording in group])
 
 
 def test_a_stream_may_not_have_a_column_that_was_not_foreseen(
@@ -224,6 +274,10 @@ def test_a_recording_without_arrivals_among_others_is_refused(path: Path) -> Non
         ({"visible": [1, 0]}, "True or False"),
         ({"arrival_ns": [0, 0.5]}, "whole nanoseconds"),
         ({"arrival_ns": [0]}, "differ in length"),
+        ({"stages": {"decode": [0]}}, "differ in length: .*stage_decode_ns"),
+        ({"stages": {"decode": [0, 0.5]}}, "stage_decode_ns: times are whole nanoseconds"),
+        ({"stages": {"De code": [0, 5]}}, "'De code' is no name of a stage: small letters"),
+        ({"stages": {"": [0, 5]}}, "'' is no name of a stage"),
     ],
 )
 def test_what_a_recording_is_made_of_is_checked(given: dict[str, Any], message: str) -> None:

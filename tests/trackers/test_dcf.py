@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from time import perf_counter_ns
+
 import numpy as np
 import pytest
 from moving import HEIGHT, WIDTH, centre_error, moving, straight
@@ -8,6 +10,7 @@ from lae_sim.boxes import iou, search_side
 from lae_sim.datasets.frames import read_image
 from lae_sim.errors import LaeError
 from lae_sim.trackers.names import make_tracker
+from lae_sim.trackers.stages import listening
 
 
 def dcf(**options):
@@ -173,6 +176,21 @@ def test_what_cannot_be_used_is_refused():
         dcf(scales=4)
     with pytest.raises(LaeError, match="it takes device, padding"):
         dcf(speed=3)
+
+
+def test_its_stages_are_most_of_a_call():
+    tracker, boxes = dcf(), straight(4)
+    frames = list(moving(boxes))
+    with listening() as call:
+        tracker.init(frames[0], boxes[0])
+    assert set(call.ns) == {"preprocess", "learn"}
+    before = perf_counter_ns()
+    with listening() as call:
+        for frame in frames[1:]:
+            tracker.track(frame)
+    elapsed = perf_counter_ns() - before
+    assert set(call.ns) == {"preprocess", "inference", "learn"}
+    assert 0.5 * elapsed < sum(call.ns.values()) <= elapsed
 
 
 def test_describes_itself():

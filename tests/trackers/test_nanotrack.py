@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import hashlib
+from time import perf_counter_ns
 
 import numpy as np
 import onnx_models
@@ -11,6 +12,7 @@ from lae_sim.boxes import iou
 from lae_sim.datasets.frames import read_image
 from lae_sim.errors import LaeError
 from lae_sim.trackers.names import make_tracker
+from lae_sim.trackers.stages import listening
 
 
 @pytest.fixture(params=["nanotrackv2", "nanotrackv3"])
@@ -56,6 +58,20 @@ def test_version_2_answers_as_the_tracker_of_opencv(shared_data):
     # OpenCV has other constants, channels in another order, and whole pixels
     assert iou(found, theirs).mean() > 0.75
     assert np.mean([centre_error(a, b) for a, b in zip(found, theirs)]) < 3
+
+
+def test_its_stages_are_most_of_a_call(shared_data, weights):
+    frames, truth = real(shared_data, "DTB70/MountainBike6", 2)
+    tracker = make_tracker("nanotrack", {"weights": str(weights)})
+    with listening() as call:
+        tracker.init(frames[0], truth[0])
+    assert set(call.ns) == {"preprocess", "inference"}
+    before = perf_counter_ns()
+    with listening() as call:
+        tracker.track(frames[1])
+    elapsed = perf_counter_ns() - before
+    assert set(call.ns) == {"preprocess", "inference", "postprocess"}
+    assert 0.5 * elapsed < call.ns["inference"] < sum(call.ns.values()) <= elapsed
 
 
 def test_is_searched_where_it_is_told(weights):
