@@ -3,8 +3,8 @@
 ``F`` holds a folder for each dataset, whose layout ``lae-sim profile --root`` knows; ``W`` the
 folders ``nanotrackv3`` and ``fear_xs`` of ONNX files (see ``docs/howto/onnx.md``). Each tracker is
 profiled on all sequences, on each number of threads, in the order 1, 2, 2, 1, so that what else the
-machine does falls on all. Scores are means over sequences, convention pysot; hold is replayed at 47
-ms a frame.
+machine does falls on all: the median time of a call, and the mean of its CPU time. Scores are means
+over sequences, convention pysot; hold is replayed at 47 ms a frame.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def trackers(weights: Path, provider: str) -> dict[str, tuple[str, dict[str, Any
 def measured(
     tracker: str, options: Mapping[str, Any], roots: Sequence[Path], threads: int
 ) -> tuple[pd.DataFrame, list[float], float]:
-    """Scores by sequence, the times of all calls in ms, and the cores that they used."""
-    scores, times, wall, cpu = [], [], 0, 0
+    """Scores by sequence, the times of all calls in ms, and their CPU time in ms per call."""
+    scores, times, calls, cpu_ns = [], [], 0, 0
     with tempfile.TemporaryDirectory() as folder:
         for root in roots:
             path = Path(folder, f"{root.name}.parquet")
@@ -59,11 +59,12 @@ def measured(
             trace = lae_sim.read_trace(path)
             for recording in trace:
                 times += (recording.elapsed_ns[1:] / 1e6).tolist()  # without the initialisation
-            for entry in trace.metadata.document["sequences"].values():
-                wall, cpu = wall + entry["measured_ns"], cpu + entry["cpu_ns"]
+                calls += len(recording)
+            entries = trace.metadata.document["sequences"].values()
+            cpu_ns += sum(entry["cpu_ns"] for entry in entries)
             found = lae_sim.evaluate(path, forecasters="hold", latency=LATENCY)
             scores.append(found.to_frame())
-    return pd.concat(scores, ignore_index=True), times, cpu / wall
+    return pd.concat(scores, ignore_index=True), times, cpu_ns / calls / 1e6
 
 
 def main() -> None:
@@ -80,22 +81,22 @@ def main() -> None:
     rows, by_sequence = [], []
     for label, (tracker, options) in trackers(arguments.weights, arguments.provider).items():
         times: dict[int, list[float]] = {n: [] for n in order}
-        cores: dict[int, list[float]] = {n: [] for n in order}
+        cpu: dict[int, list[float]] = {n: [] for n in order}
         for threads in order:
-            scores, calls, used = measured(tracker, options, roots, threads)
+            scores, calls, cpu_ms = measured(tracker, options, roots, threads)
             times[threads] += calls
-            cores[threads].append(used)
+            cpu[threads].append(cpu_ms)
         mean = scores[list(FIGURES)].mean()
         figures = [f"{mean[name]:.3f}" for name in FIGURES]
         for n in arguments.threads:
-            median, used = statistics.median(times[n]), statistics.mean(cores[n])
-            rows.append([label, str(n), *figures, f"{median:.1f}", f"{used:.2f}"])
+            median, cpu_ms = statistics.median(times[n]), statistics.mean(cpu[n])
+            rows.append([label, str(n), *figures, f"{median:.1f}", f"{cpu_ms:.1f}"])
         by_sequence += [
             [label, row["sequence"], *(f"{row[name]:.3f}" for name in FIGURES)]
             for _, row in scores.iterrows()
         ]
     heads = list(FIGURES.values())
-    print(aligned(["tracker", "threads", *heads, "ms", "cores"], rows))
+    print(aligned(["tracker", "threads", *heads, "ms", "CPU ms"], rows))
     print()
     print(aligned(["tracker", "sequence", *heads], by_sequence))
 
