@@ -8,6 +8,7 @@ of https://github.com/onnx/onnx/blob/main/onnx/onnx.proto.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 _GRAPH = 7  # of ModelProto
 _INPUT, _OUTPUT, _VALUE_INFO = 11, 12, 13  # of GraphProto, each a ValueInfoProto
@@ -17,7 +18,8 @@ _SHAPE = (
     2  # of TypeProto.Tensor; a TensorShapeProto: field 1, a dimension, whose field 1 is its size
 )
 
-_Edit = Callable[[bytes], "bytes | None"]
+if TYPE_CHECKING:
+    Edit = Callable[[bytes], bytes | None]  # of a payload; None leaves the field out
 
 
 def reshaped(model: bytes, shapes: Mapping[str, Sequence[int]]) -> bytes:
@@ -62,7 +64,7 @@ def _with_shape(value: bytes, shape: Sequence[int] | None = None) -> bytes:
     return _edited(value, {_TYPE: lambda kind: _edited(kind, {_TENSOR: tensor})})
 
 
-def _edited(message: bytes, edits: Mapping[int, _Edit]) -> bytes:
+def _edited(message: bytes, edits: Mapping[int, Edit]) -> bytes:
     """A message with other payloads in the fields of some numbers, or without these fields."""
     parts = []
     for number, payload, whole in _fields(message):
