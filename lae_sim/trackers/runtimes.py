@@ -90,7 +90,7 @@ class Runtimes:
     def __init__(self, threads: int | None = None) -> None:
         self._threads = threads
         self._models: list[tuple[str, Any, int | None]] = []  # runtime, reference, its threads
-        self._originals: list[tuple[Any, Any]] = []
+        self._wrapped: list[tuple[Any, Any, Any]] = []  # class, its __init__ before and since
         self._finder = _AfterImport(
             {
                 "onnxruntime": self._watch_onnxruntime,
@@ -102,11 +102,12 @@ class Runtimes:
         )
 
     def close(self) -> None:
-        """Leave the libraries' classes as they were."""
+        """Leave the libraries' classes as they were, as far as nobody has wrapped them since."""
         self._finder.close()
-        for kind, original in reversed(self._originals):
-            kind.__init__ = original
-        self._originals.clear()
+        self._threads = None
+        for kind, before, since in self._wrapped:
+            if kind.__init__ is since:
+                kind.__init__ = before
 
     def limit(self) -> None:
         """Set the threads of the libraries that have one number, as far as they are imported."""
@@ -160,7 +161,8 @@ class Runtimes:
                 yield runtime, model, threads
 
     def _keep(self, runtime: str, model: Any, threads: int | None) -> None:
-        self._models.append((runtime, weakref.ref(model), threads))
+        held = [each for each in self._models if each[1]() is not None]
+        self._models = [*held, (runtime, weakref.ref(model), threads)]
 
     def _wrap(self, kind: Any, init: Callable[..., None]) -> None:
         """Have objects of a class made by ``init(original, self, ...)``."""
@@ -170,7 +172,7 @@ class Runtimes:
         def __init__(self: Any, *arguments: Any, **options: Any) -> None:  # noqa: N807
             init(original, self, *arguments, **options)
 
-        self._originals.append((kind, original))
+        self._wrapped.append((kind, original, __init__))
         kind.__init__ = __init__
 
     def _watch_onnxruntime(self, module: Any) -> None:
@@ -235,7 +237,7 @@ class _AfterImport(MetaPathFinder):
 
     def close(self) -> None:
         self._calls = {}
-        sys.meta_path.remove(self)
+        sys.meta_path[:] = [finder for finder in sys.meta_path if finder is not self]
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         call = self._calls.get(fullname)

@@ -121,8 +121,21 @@ def test_classes_are_left_as_they_were(watched: Any) -> None:
     runtimes = Runtimes(1)
     assert ort.InferenceSession.__init__ is not before
     runtimes.close()
+    runtimes.close()
     assert ort.InferenceSession.__init__ is before
     assert sys.meta_path == finders
+
+
+def test_two_at_once_may_close_in_any_order(tmp_path: Path, watched: Any) -> None:
+    ort = pytest.importorskip("onnxruntime")
+    path = tmp_path / "model.onnx"
+    path.write_bytes(onnx_models.average())
+    first = Runtimes(1)
+    second = watched(2)
+    first.close()
+    session = ort.InferenceSession(str(path))
+    assert session.get_session_options().intra_op_num_threads == 2
+    assert len(second.models()) == 1
 
 
 INTERPRETER = """
