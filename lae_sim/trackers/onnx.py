@@ -66,7 +66,7 @@ def onnx_session(
             nodes would run elsewhere.
     """
     ort = _onnxruntime()
-    file = existing(path, "an ONNX model")
+    file = existing(os.fspath(path), "an ONNX model")
     wanted = _provider(ort, provider)
     providers = _providers(wanted, device, cache, dict(options or {}))
     settings = ort.SessionOptions()
