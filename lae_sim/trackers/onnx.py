@@ -138,7 +138,10 @@ def _providers(
     if wanted == _TENSORRT:
         home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
         folder = os.fspath(cache) or os.path.join(home, "lae_sim", "tensorrt")
-        os.makedirs(folder, exist_ok=True)
+        try:
+            os.makedirs(folder, exist_ok=True)
+        except OSError as error:
+            raise LaeError(f"cache={folder}: {error.strerror}") from error
         kept = {
             "trt_engine_cache_enable": True,
             "trt_engine_cache_path": folder,

@@ -198,6 +198,8 @@ def test_tensorrt_keeps_what_it_builds_and_leaves_the_rest_to_cuda(gpu, average,
     assert options["trt_engine_cache_enable"] is options["trt_fp16_enable"] is True
     assert options["trt_engine_cache_path"] == str(cache)
     assert cache.is_dir()
+    with pytest.raises(LaeError, match=r"cache=.*average\.onnx/engines: Not a directory"):
+        onnx_session(average, "TensorRT", cache=average / "engines")
     gpu.ran_on = ["CUDAExecutionProvider"] * 2  # TensorRT could do nothing
     with pytest.raises(LaeError, match="not on TensorRT"):
         onnx_session(average, "TensorRT", cache=cache)
