@@ -23,10 +23,8 @@ docs: $(VENV)/.docs  ## build the site of docs/ in site/; warnings are errors
 pages: $(VENV)/.test  ## write the outputs that README.md and docs/ show anew
 	$(BIN)/python tests/pages.py
 
-bench: $(VENV)/.test  ## measure speed and memory
-	$(BIN)/python benchmarks/run.py
-	$(BIN)/python benchmarks/profiling.py
-	$(BIN)/python benchmarks/study.py
+bench: $(VENV)/.test  ## measure speed and memory beside their targets; compiled, if numba is there
+	$(BIN)/python benchmarks/bench.py
 
 samples: $(VENV)/.demo  ## make the sample traces anew
 	$(BIN)/python traces/make_samples.py

@@ -1,4 +1,4 @@
-"""What timing a tracker costs: ``python benchmarks/profiling.py``.
+"""What timing a tracker costs.
 
 The tracker works for 1 or 5 ms and notes how long that took, so that what the stopwatch reads
 beyond it is known for each frame, on a busy machine too. The rest of the round trip, in which
@@ -7,23 +7,24 @@ frames are handed over, is outside of what is measured.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+from targets import Line
 
 from lae_sim.profile.timed import TimedTracker
 from lae_sim.profile.worker import InProcess, Worker
-from lae_sim.report.table import aligned
 from lae_sim.trackers.protocol import Image
 
-WORKS_NS = {1_000_000: 10.0, 5_000_000: 50.0}  # and how many us the stopwatch may read beyond
+WORKS_NS = {1_000_000: "stopwatch", 5_000_000: "stopwatch-5ms"}  # and what may be read beyond
 SIZES = ((640, 480), (1920, 1080))
+HEAD = ("tracker", "what", "median", "ratio to the work", "target")
 
 
 class Busy:
@@ -57,28 +58,41 @@ def medians(tracker: TimedTracker, frame: Image, calls: int) -> tuple[float, flo
     return statistics.median(trips), statistics.median(works), statistics.median(beyond)
 
 
-def lines(calls: int) -> list[list[str]]:
-    """Table lines for each frame size, in a worker process and in this one."""
-    os.chdir(Path(__file__).parent)  # where the worker finds this module
+def measured(quick: bool) -> list[Line]:
+    """Lines for each frame size, in a worker process and in this one.
+
+    Args:
+        quick: with fewer calls of the tracker.
+    """
     found = []
     kinds = {"worker process": Worker, "in this process": InProcess}
     for width, height in SIZES:
         frame = np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
-        copies = [copy_ns(frame) for _ in range(21)]
-        copy = statistics.median(copies)
-        for (work_ns, most), (name, kind) in product(WORKS_NS.items(), kinds.items()):
-            with kind("profiling:Busy", {"work_ns": work_ns}) as tracker:
-                trip, work, beyond = medians(tracker, frame, calls)
+        copy = statistics.median(copy_ns(frame) for _ in range(21))
+        for (work_ns, target), (name, kind) in product(WORKS_NS.items(), kinds.items()):
+            with beside_this(), kind("profiling:Busy", {"work_ns": work_ns}) as tracker:
+                trip, work, beyond = medians(tracker, frame, 100 if quick else 400)
             around = trip - work - beyond
             what = f"{work_ns // 10**6} ms, {width}x{height}, {name}"
+            within = f"{beyond / 1e3:.1f} us", f"{beyond / work:.4f}"
             found += [
-                [what, "round trip", f"{trip / 1e6:.3f} ms", f"{trip / work:.4f}", ""],
-                [what, "in the time measured", f"{beyond / 1e3:.1f} us"]
-                + [f"{beyond / work:.4f}", f"<= {most:g} us"],
-                [what, "around it", f"{around / 1e3:.0f} us", f"{around / work:.4f}", ""],
-                [what, "(one copy of the frame)", f"{copy / 1e3:.0f} us", f"{copy / work:.4f}", ""],
+                Line([what, "round trip", f"{trip / 1e6:.3f} ms", f"{trip / work:.4f}"]),
+                Line([what, "in the time measured", *within], {target: beyond / 1e3}),
+                Line([what, "around it", f"{around / 1e3:.0f} us", f"{around / work:.4f}"]),
+                Line([what, "(a copy of the frame)", f"{copy / 1e3:.0f} us", f"{copy / work:.4f}"]),
             ]
     return found
+
+
+@contextmanager
+def beside_this() -> Iterator[None]:
+    """Work in this folder, where the worker finds this module."""
+    before = os.getcwd()
+    os.chdir(Path(__file__).parent)
+    try:
+        yield
+    finally:
+        os.chdir(before)
 
 
 def copy_ns(frame: Image) -> int:
@@ -86,15 +100,3 @@ def copy_ns(frame: Image) -> int:
     start = time.perf_counter_ns()
     frame.copy()
     return time.perf_counter_ns() - start
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--calls", type=int, default=400, help="of the tracker (default: 400)")
-    found = lines(parser.parse_args().calls)
-    print(aligned(["tracker", "what", "median", "ratio to the work", "target"], found))
-
-
-if __name__ == "__main__":
-    main()

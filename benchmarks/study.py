@@ -1,4 +1,4 @@
-"""Speed and memory of studies: ``make bench`` or ``python benchmarks/study.py``.
+"""Speed and memory of studies.
 
 Whole processes stand beside a process that reads the same Parquet files, random latencies beside
 the SimPy engine on the same times. Seconds are those of the clock, and of all cores together (user
@@ -7,7 +7,6 @@ and system). The input has the size of UAV123: 123 sequences, 112,578 frames for
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -22,7 +21,8 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from run import CLOCK, FRAMES, has_kernels, lengths, medians, recordings, switched
+from replays import CLOCK, FRAMES, has_kernels, lengths, medians, recordings, switched
+from targets import Line
 
 from lae_sim import Metadata, Recording, Trace, replay_trace, simulate, write_trace
 from lae_sim._compiled import SWITCH
@@ -30,11 +30,11 @@ from lae_sim.engine import Times, latest, simulate_lanes
 from lae_sim.evaluation import evaluate_groups
 from lae_sim.forecast import Hold
 from lae_sim.replay import Runs, bootstrap, replay_repeated
-from lae_sim.report.table import aligned
 from lae_sim.study.pairs import Member, pairs_of
 
 RATES = (15, 20, 25, 30, 40, 50, 60, 90)  # frames/s of the trackers
 REPETITIONS = 81  # 9,963 lanes
+HEAD = ("what", "how", "median", "all cores", "MiB: worker, parent", "ratio", "target")
 READ = """
 import sys
 import pyarrow.parquet as pq
@@ -88,6 +88,12 @@ def _peak(pid: int) -> float:
     return sum(int(line.split()[1]) / 1024 for line in status.splitlines() if "VmHWM" in line)
 
 
+def line(what: str, how: str, cost: Cost, ratio: str, **figures: float) -> Line:
+    """A line of what a process took, with those of its figures that have targets."""
+    taken = f"{cost.wall:.2f} s", f"{cost.cpu:.2f} s"
+    return Line([what, how, *taken, f"{cost.worker:.0f}, {cost.parent:.0f}", ratio], figures)
+
+
 def in_turn(works: dict[str, Callable[[], Cost]], rounds: int) -> dict[str, Cost]:
     """The medians of each, measured in turn."""
     taken: dict[str, list[Cost]] = {name: [] for name in works}
@@ -136,16 +142,11 @@ def study(
     return work
 
 
-def whole_lines(folder: Path, rounds: int) -> list[list[str]]:
+def whole_lines(folder: Path, rounds: int) -> list[Line]:
     """Eight traces, 51 sigmas: the floor, hold, and hold and kalman."""
     found = []
-    for kind, jitter, *targets in (
-        ("constant times", 0.0, "", "<= 4", "<= 6"),
-        ("times jitter by 10 %", 0.1, "", "<= 5", "<= 8"),
-    ):
-        traces = [
-            write_tracker(folder / f"{kind[0]}{rate}.parquet", rate, jitter) for rate in RATES
-        ]
+    for kind, jitter in (("constant", 0.0), ("jitter", 0.1)):
+        traces = [write_tracker(path, rate, jitter) for rate, path in eight(folder, kind).items()]
         works = {
             "read the Parquet files": partial(process, "-c", READ, *traces),
             "hold": study(folder, traces, ["hold"]),
@@ -156,50 +157,56 @@ def whole_lines(folder: Path, rounds: int) -> list[list[str]]:
             works["the same, no compiled kernels"] = study(
                 folder, traces, ["hold", "kalman"], **{SWITCH: "0"}
             )
+        targets = {"hold": f"{kind}-hold", "hold + kalman": f"{kind}-kalman"}
         taken = in_turn(works, rounds)
         floor = taken["read the Parquet files"].wall
-        found += [
-            [f"8 traces, 51 sigmas, {kind}", name, f"{cost.wall:.2f} s", f"{cost.cpu:.2f} s"]
-            + [f"{cost.worker:.0f}, {cost.parent:.0f}", f"{cost.wall / floor:.1f} x floor"]
-            + [target]
-            for (name, cost), target in zip(taken.items(), targets)
-        ]
+        for name, cost in taken.items():
+            ratio = cost.wall / floor
+            figures = {targets[name]: ratio} if name in targets else {}
+            what = f"8 traces, 51 sigmas, {kind} times"
+            found.append(line(what, name, cost, f"{ratio:.1f} x floor", **figures))
     return found
 
 
-def worker_lines(folder: Path, rounds: int) -> list[list[str]]:
-    """The same study with 1, 2, 4, ... workers."""
-    traces = [str(folder / f"t{rate}.parquet") for rate in RATES]
+def eight(folder: Path, kind: str) -> dict[int, Path]:
+    """Where the traces of eight trackers are, by their frames/s."""
+    return {rate: folder / f"{kind}-{rate}.parquet" for rate in RATES}
+
+
+def worker_lines(folder: Path, rounds: int) -> list[Line]:
+    """The same study with 1, 2, 4, ... workers; its traces are there already."""
+    traces = [*map(str, eight(folder, "jitter").values())]
     cores = len(os.sched_getaffinity(0))
     counts = [*(2**k for k in range(10) if 2**k < cores), cores]
     works = {n: study(folder, traces, ["hold", "kalman"], "--workers", str(n)) for n in counts}
     taken = in_turn({str(n): work for n, work in works.items()}, rounds)
-    first = next(iter(taken.values()))
+    first = taken["1"].wall
     return [
-        ["8 traces, times jitter by 10 %, hold + kalman", f"{name} workers", f"{cost.wall:.2f} s"]
-        + [f"{cost.cpu:.2f} s", f"{cost.worker:.0f}, {cost.parent:.0f}"]
-        + [f"{first.wall / cost.wall:.2f} x as fast", ""]
+        line(
+            "8 traces, 51 sigmas, jitter times, hold + kalman",
+            f"{name} workers",
+            cost,
+            f"{first / cost.wall:.2f} x as fast",
+            **({"workers": first / cost.wall} if name == "2" else {}),
+        )
         for name, cost in taken.items()
     ]
 
 
-def size_lines(folder: Path, rounds: int, largest: int) -> list[list[str]]:
-    """One trace of 1, 10, 100 times as many sequences."""
+def size_lines(folder: Path, rounds: int, largest: int) -> list[Line]:
+    """One trace of 1, 10, ... times as many sequences."""
     found = []
     base = Cost(1, 1, 1, 1)
-    for times in (1, 10, 100):
-        if times > largest:
-            break
+    times = 1
+    while times <= largest:
         trace = write_tracker(folder / f"x{times}.parquet", 20, 0.1, times)
         work = study(folder, [trace], ["hold", "kalman"], "--workers", "2")
         cost = in_turn({"": work}, rounds if times == 1 else 1)[""]
         base = cost if times == 1 else base
         ratios = f"{cost.worker / base.worker:.2f}, {cost.parent / base.parent:.2f} x memory"
-        found += [
-            [f"one trace, {123 * times:,} sequences", "hold + kalman", f"{cost.wall:.2f} s"]
-            + [f"{cost.cpu:.2f} s", f"{cost.worker:.0f}, {cost.parent:.0f}", ratios, "flat"]
-        ]
+        found.append(line(f"one trace, {123 * times:,} sequences", "hold + kalman", cost, ratios))
         os.unlink(trace)
+        times *= 10
     return found
 
 
@@ -227,41 +234,46 @@ def write_small(folder: Path, trackers: int, datasets: int = 20) -> None:
             write_trace(Trace(metadata, recordings), path)
 
 
-def many_lines(folder: Path, traces: int) -> list[list[str]]:
+def many_lines(folder: Path, traces: int) -> list[Line]:
     """A study of many small traces of 20 datasets, all pairs and the report, and once more."""
-    write_small(folder / "small", traces // 20)
-    file, out = folder / "small.toml", folder / "small-results"
-    file.write_text(f'traces = ["{folder}/small/*.parquet"]\n', encoding="utf-8")
+    name = f"small-{traces}"
+    write_small(folder / name, traces // 20)
+    file, out = folder / f"{name}.toml", folder / f"{name}-results"
+    file.write_text(f'traces = ["{folder / name}/*.parquet"]\n', encoding="utf-8")
     first, again = (
         process("-m", "lae_sim", "study", str(file), "--out", str(out)) for _ in range(2)
     )
-    files = sum(path.is_file() for path in out.rglob("*"))
+    left = [path.stat().st_size / 1e6 for path in out.rglob("*") if path.is_file()]
     report = (out / "report.html").stat().st_size / 1e6
-    targets = ("<= 8 s", "<= 2 s") if traces == 1000 else ("<= 600 s, < 500 MiB, < 5 MB", "")
+    if traces == 1000:
+        figures, again_figures = {"small": first.wall}, {"small-again": again.wall}
+    else:
+        peak = max(first.parent, again.parent)
+        figures = {"large": first.wall, "large-parent": peak, "large-report": report}
+        again_figures = {}
+    what = f"{traces:,} traces of 8 x 60 frames, 20 datasets"
+    size = f"{len(left)} files of {sum(left):.0f} MB, report {report:.1f} MB"
     return [
-        [f"{traces:,} traces of 8 x 60 frames, 20 datasets", name, f"{cost.wall:.2f} s"]
-        + [f"{cost.cpu:.2f} s", f"{cost.worker:.0f}, {cost.parent:.0f}"]
-        + [f"{files} files, report {report:.1f} MB", target]
-        for name, cost, target in zip(("all", "nothing to do"), (first, again), targets)
+        line(what, "all", first, size, **figures),
+        line(what, "nothing to do", again, "", **again_figures),
     ]
 
 
-def pair_lines(rounds: int) -> list[list[str]]:
-    """Pairs of 100 traces of 123 sequences: one by one, and as studies compare them."""
+def pair_lines(rounds: int) -> list[Line]:
+    """Pairs of 100 traces of 123 sequences: as studies compare them, in one process."""
     rng = np.random.default_rng(0)
     found = []
-    for repetitions, target in ((1, "<= 0.2"), (100, "<= 0.2")):
+    for repetitions in (1, 100):
         names = tuple(f"{s:03}" for s in range(123))
         members = [Member(names, rng.random((repetitions, 123))) for _ in range(100)]
-        taken = medians({"": lambda members=members: pairs_of(members)}, rounds)[""]
-        found.append(
-            [f"4,950 pairs, 123 sequences, {repetitions} repetitions", "one process"]
-            + [f"{taken / 4950 * 1e3:.3f} ms each", "", "", "", target]
-        )
+        taken = medians({"": lambda members=members: pairs_of(members)}, rounds)[""] / 4950 * 1e3
+        what = f"4,950 pairs, 123 sequences, {repetitions} repetitions"
+        cells = [what, "one process", f"{taken:.3f} ms each", ""]
+        found.append(Line(cells, {"pairs": taken}))
     return found
 
 
-def lane_lines(rounds: int) -> list[list[str]]:
+def lane_lines(rounds: int) -> list[Line]:
     """Random latencies: million world frames a second."""
     metadata = Metadata.new("30", "every-frame")
     trace = Trace(metadata, list(recordings(lengths())))
@@ -311,44 +323,30 @@ def lane_lines(rounds: int) -> list[list[str]]:
         for name, seconds in taken.items()
     }
     targets = {
-        "schedule alone": ">= 30",
-        "schedule alone, compiled": ">= 150 M frames/s",
-        "and scores, hold, compiled": ">= 20 M frames/s",
+        "schedule alone, compiled": "schedule",
+        "and scores, hold, compiled": "scores",
     }
     return [
-        [f"random latencies, {len(every):,} lanes", name, f"{rate:.2f} M frames/s", "", ""]
-        + [f"{rate / speed['SimPy, schedule alone']:.1f} x SimPy", targets.get(name, "")]
+        Line(
+            [f"random latencies, {len(every):,} lanes", name, f"{rate:.2f} M frames/s"]
+            + [f"{rate / speed['SimPy, schedule alone']:.1f} x SimPy"],
+            {targets[name]: rate} if name in targets else {},
+        )
         for name, rate in speed.items()
     ]
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--rounds", type=int, default=3, help="measurements of each (default: 3)")
-    parser.add_argument(
-        "--largest", type=int, default=10, help="times UAV123, for the memory: 1, 10 or 100"
-    )
-    parser.add_argument(
-        "--traces", type=int, default=1000, help="small traces of a study: 1000 or 10000"
-    )
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        found = whole_lines(folder, arguments.rounds)
-        found += worker_lines(folder, arguments.rounds)
-        found += size_lines(folder, arguments.rounds, arguments.largest)
-        found += many_lines(folder, arguments.traces)
-    found += pair_lines(arguments.rounds)
-    found += lane_lines(arguments.rounds)
-    head = ["what", "how", "median", "all cores", "MiB: worker, parent", "ratio", "target"]
-    print(aligned(head, found))
-    print(
-        "\nPublished results have a mean fps, so constant times. Where times jitter around a "
-        "multiple of\nthe frame interval, each sigma has a history of its own for kalman: up to 51 "
-        "times the work."
-    )
+def measured(folder: Path, quick: bool) -> Iterator[list[Line]]:
+    """All of these lines, but for those of parts of studies, some of which are compiled.
 
-
-if __name__ == "__main__":
-    main()
+    Args:
+        folder: for what is written.
+        quick: each once, and without what takes long.
+    """
+    rounds = 1 if quick else 3
+    yield whole_lines(folder, rounds)
+    yield worker_lines(folder, rounds)
+    yield size_lines(folder, rounds, 1 if quick else 10)
+    yield many_lines(folder, 1000)
+    if not quick:
+        yield many_lines(folder, 10_000)

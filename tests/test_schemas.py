@@ -70,7 +70,9 @@ def test_compare() -> None:
 
 
 def test_show(gaps: Path) -> None:
-    *_, last = printed("show", SLOW, REAL_TIME, gaps)["traces"]
+    staged = TRACES / "cases" / "valid" / "stages.parquet"
+    *_, of_stages, last = printed("show", SLOW, REAL_TIME, staged, gaps)["traces"]
+    assert [row["stage"] for row in of_stages["times"]["stages"]] == ["decode", "inference", None]
     assert last["reach"]["bins"]
 
 

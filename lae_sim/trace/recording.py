@@ -75,9 +75,14 @@ class Recording:
     @property
     def columns(self) -> dict[str, npt.NDArray[Any]]:
         """What it has of a trace's optional columns, by their names."""
-        found = {name: getattr(self, name) for name in OPTIONAL_COLUMNS}
-        found |= {stage_column(name): self.stages[name] for name in in_order(self.stages)}
-        return {name: values for name, values in found.items() if values is not None}
+        found: dict[str, npt.NDArray[Any]] = {}
+        if self.arrival_ns is not None:
+            found["arrival_ns"] = self.arrival_ns
+        if self.visible is not None:
+            found["visible"] = self.visible
+        if self.stages:  # most have none, and there may be many recordings
+            found |= {stage_column(name): self.stages[name] for name in in_order(self.stages)}
+        return found
 
     @classmethod
     def new(

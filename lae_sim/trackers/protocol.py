@@ -43,6 +43,8 @@ class Tracker(Protocol):
       whether a cosine window weighs what is searched, so that a target near its edge is harder to
       find; and where the number is from, in words. Leave search out where it is not known;
     - ``close()``: give resources back.
+
+    In its calls it may mark stages, whose times the trace then has (`lae_sim.trackers.stage`).
     """
 
     def init(self, frame: Image, box: Box) -> None:

@@ -52,6 +52,23 @@ def test_scores_are_those_of_evaluating(results: lae_sim.StudyResults) -> None:
     assert len(results.to_frame()) == len(evaluated.to_frame())
 
 
+def test_the_times_of_stages_are_a_latency_of_a_study(tmp_path: Path) -> None:
+    staged = TRACES / "cases" / "valid" / "stages.parquet"
+    latencies = ["recorded", "stage:decode,init=60ms", "stage:warp"]
+    results = lae_sim.run_study(
+        traces=[staged], latencies=latencies, forecasters="hold", folder=tmp_path, workers=1
+    )
+    (lacking,) = results.failures
+    assert "no times of stage 'warp'" in lacking.reason
+    evaluated = [
+        lae_sim.evaluate(staged, latency=each, forecasters="hold") for each in latencies[:2]
+    ]
+    expected = {row.latency: row.auc for each in evaluated for row in each.summary.itertuples()}
+    found = {row.latency: row.scores["auc"] for row in results.summary}
+    assert found == pytest.approx(expected, abs=1e-12)
+    assert len(set(found.values())) == 2
+
+
 def test_what_is_left_in_the_folder(results: lae_sim.StudyResults) -> None:
     folder = results.folder
     assert (folder / "report.html").is_file()

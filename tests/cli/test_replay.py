@@ -178,6 +178,20 @@ def test_policies_by_name(policy):
     assert report["processed"] == sum(len(run.schedule.frames) for run in runs)
 
 
+def test_a_stage_alone_is_faster_and_has_an_initialisation_of_its_own():
+    staged = REPOSITORY / "traces" / "cases" / "valid" / "stages.parquet"
+    error = replay(staged, "--latency", "stage:decode", status=2)
+    assert "sequence 'a', frame 0: the trace has no time of decode for it" in error
+    assert ",init=TIME" in error
+    (found,) = replay_json(staged, "--latency", "stage:decode,init=2ms")["traces"]
+    assert found["latency"] == "stage:decode,init=2ms"
+    assert found["init"]["mean_ms"] == 2
+    assert 950 < found["tracker_fps"] < 1050
+    error = replay(staged, "--latency", "stage:warp,init=2ms", status=2)
+    assert "no times of stage 'warp'" in error
+    assert "there are decode, inference" in error
+
+
 def test_vot_realtime_says_that_it_never_scores_latency():
     assert "never scores latency" in replay(SLOW, "--policy", "vot-realtime")
     vot, plain = (

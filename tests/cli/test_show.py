@@ -114,6 +114,21 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def test_stages_are_a_table(run: Callable[..., str], tmp_path: Path) -> None:
+    boxes = np.tile([10.0, 20, 30, 40], (3, 1))
+    stages = {"warp": [-1, 1 * MS, 3 * MS], "inference": [-1, 20 * MS, 24 * MS]}
+    made = Recording.new("a", boxes, boxes, np.array([90, 40, 40]) * MS, stages=stages)
+    write_trace(Trace(Metadata.new("30", "every-frame"), [made]), tmp_path / "t.parquet")
+    lines = [line.split() for line in run(tmp_path / "t.parquet").splitlines()]
+    start = lines.index(["stages,", "ms", "n", "median", "p95", "share"])
+    assert lines[start + 2 : start + 6] == [
+        ["inference", "2", "22.0", "23.8", "55.0%"],
+        ["warp", "2", "2.00", "2.90", "5.0%"],
+        ["(the", "rest)", "2", "16.0", "18.7", "40.0%"],
+        [],
+    ]
+
+
 def test_everything_that_a_profile_says_is_shown(
     run: Callable[..., str], full: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -63,12 +63,17 @@ def dataset(*names: str) -> Dataset:
 class Reaching(FakeTimed):
     """Finds the bright target if it is nearer than a reach, which is drawn at initialisations."""
 
-    def __init__(self, reaches: Sequence[float], init_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        reaches: Sequence[float],
+        init_s: float = 0.0,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
         super().__init__()
-        self._reaches, self._init_s, self.inits = reaches, init_s, 0
+        self._reaches, self._init_s, self.sleep, self.inits = reaches, init_s, sleep, 0
 
     def init(self, frame: Image, box: Sequence[float]) -> Answer:
-        time.sleep(self._init_s)
+        self.sleep(self._init_s)
         self._limit = self._reaches[self.inits % len(self._reaches)] * SIDE
         self.inits += 1
         return super().init(frame, box)
@@ -255,22 +260,57 @@ def test_few_own_jumps_are_spread_over_the_gaps() -> None:
     assert plans == [(14,), (5, 14, 40), OWN_GAPS]
 
 
-def test_a_budget_makes_fewer_and_says_so(tmp_path: Path) -> None:
-    tracker, data = Reaching([0.7], init_s=0.02), dataset("a", "b")
-    began = time.monotonic()
+class Clock:
+    """Stands in for ``time`` in the gap pass: its seconds pass only when they are told to."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr("lae_sim.profile.gaps.time", made)
+    return made
+
+
+def test_a_budget_makes_fewer_and_says_so(tmp_path: Path, clock: Clock) -> None:
+    tracker, data = Reaching([0.7], init_s=0.02, sleep=clock.sleep), dataset("a", "b")
     trace, notices, _ = gap_pass(tmp_path, data, tracker, budget="1s")
-    assert time.monotonic() - began < 5
+    assert clock.now < 1.1  # three restarts that tell how long one takes, and those within 1 s
     schedule = trace.metadata.document["schedule"]
+    # 0.85 s are planned for: all 18 own jumps, and restarts of 0.02 s each in what they leave
+    assert (schedule["own_jumps"], schedule["restarts"]) == (18, 24)
     assert schedule["budget"] == "1 s"
-    assert 0 < schedule["restarts"] < 60
-    assert schedule["left_out"]["restarts"] == 1000 - schedule["restarts"]
-    (notice,) = notices
-    assert "an initialisation takes 0.02" in notice
-    assert "of 18 own jumps" in notice
-    assert "of 1,000 restarts" in notice
+    assert schedule["left_out"] == {"own_jumps": 0, "restarts": 976}
+    assert notices == [
+        "gaps: an initialisation takes 0.02 s here, a call 0 s: within 1 s 18 of 18 own jumps and "
+        "24 of 1,000 restarts; a larger budget makes more"
+    ]
 
 
-def test_what_only_the_first_frame_takes_is_not_counted_again_and_again(tmp_path: Path) -> None:
+def test_what_takes_longer_than_it_did_ends_with_the_budget(tmp_path: Path, clock: Clock) -> None:
+    tracker, data = Reaching([0.7], init_s=0.02, sleep=clock.sleep), dataset("a", "b")
+
+    def slower(seconds: float) -> None:
+        clock.sleep(seconds if tracker.inits < 3 else 3 * seconds)
+
+    tracker.sleep = slower
+    trace, _, _ = gap_pass(tmp_path, data, tracker, budget="1s")
+    assert clock.now < 1.2
+    schedule = trace.metadata.document["schedule"]
+    assert 0 < schedule["own_jumps"] + schedule["restarts"] < 18
+
+
+def test_what_only_the_first_frame_takes_is_not_counted_again_and_again(
+    tmp_path: Path, clock: Clock
+) -> None:
     slow: set[str] = set()
 
     def opened(name: str) -> ImageSequence:
@@ -279,14 +319,15 @@ def test_what_only_the_first_frame_takes_is_not_counted_again_and_again(tmp_path
         def read(frame: int) -> Image:
             if name not in slow:
                 slow.add(name)
-                time.sleep(0.3)
+                clock.sleep(0.3)
             return made.read(frame)
 
         return ImageSequence(name, made.truth, read)
 
     data = Dataset("d", Fraction(30), [opened("a"), opened("b")])
-    trace, _, _ = gap_pass(tmp_path, data, Reaching([0.7]), budget="4s")
-    assert trace.metadata.document["schedule"]["restarts"] > 100
+    trace, notices, _ = gap_pass(tmp_path, data, Reaching([0.7]), budget="1s")
+    assert notices == []
+    assert trace.metadata.document["schedule"]["restarts"] == 1000
 
 
 def test_all_that_there_are_is_not_fewer(tmp_path: Path) -> None:

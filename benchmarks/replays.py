@@ -1,4 +1,4 @@
-"""Speed and memory, side by side in one run: ``make bench`` or ``python benchmarks/run.py``.
+"""Speed and memory of the engine, of forecasters and of commands on one trace.
 
 Each figure stands beside its peer or its floor, measured in turn with it, and the medians of
 several rounds are compared. The input has the size of UAV123: 123 sequences, 112,578 frames.
@@ -6,16 +6,15 @@ several rounds are compared. The input has the size of UAV123: 123 sequences, 11
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import os
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 import simpy
 from filterpy.kalman import KalmanFilter
+from targets import Line
 
 from lae_sim import Metadata, Recording, Trace, replay_trace, simulate, write_trace
 from lae_sim._compiled import SWITCH
@@ -32,9 +32,11 @@ from lae_sim.evaluation.metrics import METRICS
 from lae_sim.forecast.base import ForecasterFactory, Hold, Lanes, defines, forecast
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.report.table import aligned
 
 SEQUENCES, FRAMES = 123, 112_578
+DTB70 = 70, 15_777  # its sequences and frames
+MANY = 100_000  # sequences of the trace that tells how memory grows
+HEAD = ("what", "how", "median", "ratio", "target")
 ELAPSED_NS = 47_000_000
 CLOCK = Clock(30, 10**9)
 READ = """
@@ -60,10 +62,10 @@ print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM"
 """
 
 
-def lengths() -> np.ndarray:
-    """Sequence lengths that add up to the frames of UAV123."""
-    weights = np.random.default_rng(0).lognormal(0, 0.6, SEQUENCES)
-    ends = np.round(np.cumsum(weights) / weights.sum() * FRAMES).astype(int)
+def lengths(sequences: int = SEQUENCES, frames: int = FRAMES) -> np.ndarray:
+    """Sequence lengths that add up to the frames of a dataset: UAV123."""
+    weights = np.random.default_rng(0).lognormal(0, 0.6, sequences)
+    ends = np.round(np.cumsum(weights) / weights.sum() * frames).astype(int)
     return np.diff(ends, prepend=0)
 
 
@@ -155,7 +157,7 @@ def camera_and_queries(length: int) -> list[tuple[int, int]]:
     return pairs
 
 
-def engine_lines(rounds: int) -> list[list[str]]:
+def engine_lines(rounds: int) -> list[Line]:
     """The engine against its floor and the plain event-driven design, per world frame."""
     sizes = lengths().tolist()
     service = lambda frame: ELAPSED_NS  # noqa: E731
@@ -169,7 +171,8 @@ def engine_lines(rounds: int) -> list[list[str]]:
         },
         rounds,
     )
-    return lines("schedule, constant 47 ms", found, "engine", FRAMES, "us per world frame", 1.0)
+    unit = "us per world frame"
+    return lines("schedule, constant 47 ms", found, "engine", FRAMES, unit, {"engine": "engine"})
 
 
 def dense_filter() -> KalmanFilter:
@@ -181,7 +184,7 @@ def dense_filter() -> KalmanFilter:
     return dense
 
 
-def forecaster_lines(rounds: int) -> list[list[str]]:
+def forecaster_lines(rounds: int) -> list[Line]:
     """An update and a prediction of each forecaster, against filterpy and the paper's speed.
 
     One box after another, and over many lanes at once. The paper's 500 frames/s are 2,000 us.
@@ -219,10 +222,7 @@ def forecaster_lines(rounds: int) -> list[list[str]]:
     found = medians(works, rounds)
     unit = "us per update and prediction"
     what = "forecaster, one box at a time"
-    rows = [
-        [*row[:-1], "<= 40" if row[1] == "learned" else ""]
-        for row in lines(what, found, "kalman in filterpy", count, unit)
-    ]
+    rows = lines(what, found, "kalman in filterpy", count, unit, {"learned": "learned"})
     asked = np.arange(len(frames))
     together = {
         name: partial(forecast, factory, lanes, asked, frames + 3)
@@ -230,12 +230,10 @@ def forecaster_lines(rounds: int) -> list[list[str]]:
         if defines(factory, "forecast_lanes")
     }
     for name, work in together.items():
-        taken = medians({name: work}, min(rounds, 3))[name] / len(asked) * count
-        rows += [
-            [f"forecaster, {many:,} lanes at once", name, f"{taken / count * 1e6:.3f} {unit}"]
-            + [f"{taken / found['kalman in filterpy']:.4f}"]
-            + ["<= 1.5" if name == "learned" else ""]
-        ]
+        taken = medians({name: work}, min(rounds, 3))[name] / len(asked)
+        ratio = f"{taken * count / found['kalman in filterpy']:.4f}"
+        cells = [f"forecaster, {many:,} lanes at once", name, f"{taken * 1e6:.3f} {unit}", ratio]
+        rows.append(Line(cells, {"learned-lanes": taken * 1e6} if name == "learned" else {}))
     return rows
 
 
@@ -260,13 +258,13 @@ def has_kernels() -> bool:
     return importlib.util.find_spec("numba") is not None and os.environ.get(SWITCH) != "0"
 
 
-def kernel_lines(trace: str, rounds: int) -> list[list[str]]:
+def kernel_lines(trace: str, rounds: int) -> list[Line]:
     """Compiled kernels beside NumPy's lines, in one process that has them compiled.
 
-    They load numba, which other lines must not: these are the last of their process.
+    They load numba, which other lines must not: these come after them.
     """
     if not has_kernels():
-        return [["compiled kernels", "numba is not installed: the extra fast", "", "", ""]]
+        return [Line(["compiled kernels: numba is not installed, the extra fast", "", "", ""])]
     rng = np.random.default_rng(3)
     many, count = 1000, 900
     offsets = np.arange(many + 1) * count
@@ -283,46 +281,54 @@ def kernel_lines(trace: str, rounds: int) -> list[list[str]]:
         for _ in evaluate_groups(runs, metadata, factories, SIGMA_GRID):
             pass
 
-    works: dict[str, tuple[Callable[[], object], float, str, str]] = {
+    update, frame = "us per update and prediction", "us per world frame"
+    works: dict[str, tuple[Callable[[], object], int, str]] = {
         f"kalman, {many:,} lanes": (
             lambda: forecast(kalman, lanes, asked, frames + 3),
             len(asked),
-            "us per update and prediction",
-            "<= 0.02 us",
+            update,
         ),
-        "51 sigmas, hold": (lambda: scored(hold=Hold), FRAMES, "us per world frame", ""),
-        "51 sigmas, hold + kalman": (
-            lambda: scored(hold=Hold, kalman=kalman),
-            FRAMES,
-            "us per world frame",
-            "",
-        ),
+        "51 sigmas, hold": (lambda: scored(hold=Hold), FRAMES, frame),
+        "51 sigmas, hold + kalman": (lambda: scored(hold=Hold, kalman=kalman), FRAMES, frame),
     }
     rows = []
-    for name, (work, size, unit, target) in works.items():
+    for name, (work, size, unit) in works.items():
         switched("1", work)()  # compiles
         ways = {"NumPy": switched("0", work), "compiled": switched("1", work)}
-        taken = medians(ways, rounds)
-        rows += [
-            [f"compiled kernels: {name}", way, f"{each / size * 1e6:.4f} {unit}"]
-            + [f"{each / taken['NumPy']:.3f}", target if way == "compiled" else ""]
-            for way, each in taken.items()
-        ]
+        targets = {"compiled": "kalman-lanes"} if unit == update else {}
+        rows += lines(
+            f"compiled kernels: {name}", medians(ways, rounds), "NumPy", size, unit, targets
+        )
     return rows
 
 
 def lines(
     what: str,
-    found: dict[str, float],
+    found: Mapping[str, float],
     base: str,
     count: int,
     unit: str,
-    target: float | None = None,
-) -> list[list[str]]:
-    """Table lines of seconds over a number of items, with ratios to the base."""
+    targets: Mapping[str, str],
+) -> list[Line]:
+    """Lines of seconds over a number of items, with ratios to the base, and targets of some."""
     return [
-        [what, name, f"{taken / count * 1e6:.3f} {unit}", f"{taken / found[base]:.2f}"]
-        + [f"<= {target:g}" if target and name == base else ""]
+        Line(
+            [what, name, f"{taken / count * 1e6:.4g} {unit}", f"{taken / found[base]:.2f}"],
+            {targets[name]: taken / count * 1e6} if name in targets else {},
+        )
+        for name, taken in found.items()
+    ]
+
+
+def ratio_lines(
+    what: str, found: Mapping[str, float], base: str, targets: Mapping[str, str]
+) -> list[Line]:
+    """Lines of seconds, with ratios to the base, and the targets of some ratios."""
+    return [
+        Line(
+            [what, name, f"{taken:.2f} s", f"{taken / found[base]:.2f}"],
+            {targets[name]: taken / found[base]} if name in targets else {},
+        )
         for name, taken in found.items()
     ]
 
@@ -333,7 +339,7 @@ def process(*arguments: str) -> Callable[[], object]:
     return lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
-def process_lines(trace: str, rounds: int) -> list[list[str]]:
+def process_lines(trace: str, rounds: int) -> list[Line]:
     """Whole processes, imports included, against reading the file."""
     plain = ("-m", "lae_sim.replay", trace, "--search", "off", "--json")
     grid = (*plain, "--sigma-grid", "--forecaster")
@@ -345,40 +351,51 @@ def process_lines(trace: str, rounds: int) -> list[list[str]]:
         "51 sigmas, hold + kalman-lae-pvt": process(*grid, "hold", "kalman-lae-pvt"),
         "--help": process("-m", "lae_sim.replay", "--help"),
     }
-    targets = {"51 sigmas, hold": 2.5, "51 sigmas, hold + kalman": 3.0, "--help": 0.3}
+    targets = {
+        "51 sigmas, hold": "trace-hold",
+        "51 sigmas, hold + kalman": "trace-kalman",
+        "--help": "help",
+    }
     found = medians(works, rounds)
-    return [
-        ["whole process, UAV123 size", name, f"{taken:.2f} s"]
-        + [f"{taken / found['read the Parquet file']:.2f}"]
-        + [f"<= {targets[name]:g}" if name in targets else ""]
-        for name, taken in found.items()
-    ]
+    return ratio_lines("whole process, UAV123 size", found, "read the Parquet file", targets)
 
 
-def hand_lines(trace: str, rounds: int) -> list[list[str]]:
+def compare_lines(folder: Path, rounds: int) -> list[Line]:
+    """Whole processes that compare forecasters, one of them trained in folds."""
+    trace = str(folder / "dtb70-sized.parquet")
+    sizes = lengths(*DTB70)
+    write_trace(Trace(Metadata.new("30", "every-frame"), recordings(sizes)), trace)
+    plain = ("-m", "lae_sim", "compare", trace, "--search", "off", "--json", "--forecaster")
+    works = {name: process(*plain, name) for name in ("kalman", "tuned-kalman")}
+    taken = medians(works, rounds)
+    found = ratio_lines("compare, DTB70 size", taken, "kalman", {})
+    return [found[0], replace(found[1], figures={"compare": taken["tuned-kalman"]})]
+
+
+def hand_lines(trace: str, rounds: int, forecasters: Sequence[str], target: str) -> list[Line]:
     """Whole processes against the script that one would write instead, and the same scores."""
-    found = []
     script = str(Path(__file__).with_name("by_hand.py"))
-    for forecasters, times, target in ((["hold"], rounds, 6), (["hold", "kalman"], 1, 100)):
-        taken = []
-        for _ in range(times):
-            by_hand, theirs = printed(script, trace, *forecasters[1:])
-            report, ours = printed(
-                *("-m", "lae_sim.replay", trace, "--search", "off", "--sigma-grid", "--json"),
-                *("--forecaster", *forecasters),
-            )
-            for name in forecasters:
-                results = [r for r in report["traces"][0]["results"] if r["forecaster"] == name]
-                scores = [[result[metric] for metric in METRICS] for result in results]
-                np.testing.assert_allclose(scores, by_hand[name], rtol=0, atol=1e-12)
-            taken.append((theirs, ours))
-        theirs, ours = (statistics.median(column) for column in zip(*taken))
-        what = f"51 sigmas, {' + '.join(forecasters)}: ours against the script"
-        found += [
-            [what, "by hand (benchmarks/by_hand.py)", f"{theirs:.2f} s", "1.00", ""],
-            [what, "ours", f"{ours:.2f} s", f"{theirs / ours:.1f} x as fast", f">= {target}"],
-        ]
-    return found
+    taken = []
+    for _ in range(rounds):
+        by_hand, theirs = printed(script, trace, *forecasters[1:])
+        report, ours = printed(
+            *("-m", "lae_sim.replay", trace, "--search", "off", "--sigma-grid", "--json"),
+            *("--forecaster", *forecasters),
+        )
+        for name in forecasters:
+            results = [r for r in report["traces"][0]["results"] if r["forecaster"] == name]
+            scores = [[result[metric] for metric in METRICS] for result in results]
+            np.testing.assert_allclose(scores, by_hand[name], rtol=0, atol=1e-12)
+        taken.append((theirs, ours))
+    theirs, ours = (statistics.median(column) for column in zip(*taken))
+    what = f"51 sigmas, {' + '.join(forecasters)}: ours against the script"
+    return [
+        Line([what, "by hand (benchmarks/by_hand.py)", f"{theirs:.2f} s", "1.00"]),
+        Line(
+            [what, "ours", f"{ours:.2f} s", f"{theirs / ours:.1f} x as fast"],
+            {target: theirs / ours},
+        ),
+    ]
 
 
 def printed(*arguments: str) -> tuple[dict[str, Any], float]:
@@ -399,7 +416,7 @@ def gap_pass(count: int) -> Iterator[Recording]:
         yield Recording.new(f"r{k:04}@1+1", np.array([box, then]), np.array([box, answer]), elapsed)
 
 
-def search_lines(trace: str, folder: Path, rounds: int) -> list[list[str]]:
+def search_lines(trace: str, folder: Path, rounds: int) -> list[Line]:
     """Whole processes with the search model, against one without."""
     gaps = str(folder / "gaps.parquet")
     write_trace(Trace(Metadata.new("30", "restarts"), gap_pass(1000)), gaps)
@@ -410,14 +427,9 @@ def search_lines(trace: str, folder: Path, rounds: int) -> list[list[str]]:
         "c unknown": process(*grid, "trace"),
         "c measured, 40 draws": process(*grid, "trace", "--strided", gaps),
     }
-    targets = {"c = 0.7": "<= 2", "c measured, 40 draws": "<= 15"}
     found = medians(works, rounds)
-    base = found["no search model"]
-    return [
-        ["51 sigmas, hold + kalman", name, f"{taken:.2f} s", f"{taken / base:.2f}"]
-        + [targets.get(name, "")]
-        for name, taken in found.items()
-    ]
+    targets = {"c = 0.7": "search", "c measured, 40 draws": "search-draws"}
+    return ratio_lines("51 sigmas, hold + kalman", found, "no search model", targets)
 
 
 def peak(code: str, *arguments: str) -> tuple[float, float]:
@@ -429,7 +441,7 @@ def peak(code: str, *arguments: str) -> tuple[float, float]:
     return int(done.stdout.split()[-1]) / 1024, time.perf_counter() - start
 
 
-def memory_lines(folder: Path, sequences: int) -> list[list[str]]:
+def memory_lines(folder: Path, sequences: int) -> list[Line]:
     """Peak memory of a trace of very many sequences, against reading the file alone."""
     trace = str(folder / "many.parquet")
     write_trace(Trace(Metadata.new("30", "every-frame"), recordings(np.full(sequences, 30))), trace)
@@ -440,31 +452,39 @@ def memory_lines(folder: Path, sequences: int) -> list[list[str]]:
         "the same, 51 sigmas": peak(REPLAY, trace, "--sigma-grid"),
     }
     base = found["read the file in batches"][0]
-    targets = {"replay, hold + kalman": "< 150", "the same, 51 sigmas": "< 300"}
+    targets = {"replay, hold + kalman": "memory", "the same, 51 sigmas": "memory-grid"}
     return [
-        [f"peak memory, {sequences:,} sequences", f"{name} ({taken:.1f} s)", f"{mib:.0f} MiB"]
-        + [f"{mib / base:.2f}", targets.get(name, "")]
+        Line(
+            [f"peak memory, {sequences:,} sequences", f"{name} ({taken:.1f} s)"]
+            + [f"{mib:.0f} MiB", f"{mib / base:.2f}"],
+            {targets[name]: mib} if name in targets and sequences == MANY else {},
+        )
         for name, (mib, taken) in found.items()
     ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--rounds", type=int, default=5, help="measurements of each (default: 5)")
-    parser.add_argument("--sequences", type=int, default=100_000, help="for the peak memory")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        trace = folder / "uav123-sized.parquet"
-        write_trace(Trace(Metadata.new("30", "every-frame"), recordings(lengths())), trace)
-        found = engine_lines(arguments.rounds) + forecaster_lines(arguments.rounds)
-        found += process_lines(str(trace), arguments.rounds)
-        found += hand_lines(str(trace), arguments.rounds)
-        found += search_lines(str(trace), folder, arguments.rounds)
-        found += memory_lines(folder, arguments.sequences)
-        found += kernel_lines(str(trace), arguments.rounds)
-    print(aligned(["what", "how", "median", "ratio", "target"], found))
+def write_one(folder: Path) -> str:
+    """Write the trace that most lines are about."""
+    trace = folder / "uav123-sized.parquet"
+    write_trace(Trace(Metadata.new("30", "every-frame"), recordings(lengths())), trace)
+    return str(trace)
 
 
-if __name__ == "__main__":
-    main()
+def measured(folder: Path, quick: bool) -> Iterator[list[Line]]:
+    """All of these lines, but for those of compiled kernels.
+
+    Args:
+        folder: for what is written.
+        quick: each once, and without what takes long.
+    """
+    rounds = 1 if quick else 5
+    trace = write_one(folder)
+    yield engine_lines(rounds)
+    yield forecaster_lines(rounds)
+    yield process_lines(trace, rounds)
+    yield hand_lines(trace, rounds, ["hold"], "script-hold")
+    if not quick:
+        yield hand_lines(trace, 1, ["hold", "kalman"], "script-kalman")
+    yield compare_lines(folder, rounds)
+    yield search_lines(trace, folder, rounds)
+    yield memory_lines(folder, MANY // 10 if quick else MANY)
