@@ -205,17 +205,6 @@ def test_tensorrt_keeps_what_it_builds_and_leaves_the_rest_to_cuda(gpu, average,
         onnx_session(average, "TensorRT", cache=cache)
 
 
-def test_shapes_of_a_file_are_those_that_onnx_writes(tmp_path):
-    onnx = pytest.importorskip("onnx")
-    made = onnx.load_from_string(reshaped(onnx_models.average(), {"input": (1, 3, 127, 127)}))
-    (given,), (found,) = made.graph.input, made.graph.output
-    assert [side.dim_value for side in given.type.tensor_type.shape.dim] == [1, 3, 127, 127]
-    assert not found.type.tensor_type.HasField("shape")
-    assert not made.graph.value_info
-    inferred = onnx.shape_inference.infer_shapes(made).graph.output[0].type.tensor_type.shape
-    assert [side.dim_value for side in inferred.dim] == [1, 3, 8, 8]
-
-
 @given(st.binary(max_size=200), st.integers(0, 300))
 def test_other_bytes_have_no_shapes(noise: bytes, end: int) -> None:
     whole = onnx_models.average()
