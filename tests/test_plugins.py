@@ -16,7 +16,7 @@ from lae_sim.errors import LaeError
 from lae_sim.learning.registry import load_any, load_forecaster
 from lae_sim.plugins import imported, looking_in
 from lae_sim.profile.worker import InProcess
-from lae_sim.replay.world import parse_latency, parse_policy
+from lae_sim.replay.names import parse_latency, parse_policy
 
 SLOW = str(REPOSITORY / "traces" / "synthetic-slow.parquet")
 

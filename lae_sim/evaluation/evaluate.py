@@ -588,8 +588,8 @@ def lanes_of(
     recordings, which = runs.distinct
     first = np.full((len(recordings), 2), np.inf)
     resized: dict[int, ImageSizes] = {}
-    for k, recording in enumerate(recordings if metadata is not None else ()):
-        sizes = metadata.image_sizes(recording.name)
+    for k, recording in enumerate(recordings):
+        sizes = None if metadata is None else metadata.image_sizes(recording.name)
         if sizes is None:
             continue
         first[k] = sizes.at(0)

@@ -22,6 +22,7 @@ from lae_sim.engine.times import Times
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
 from lae_sim.replay.passes import split_passes
+from lae_sim.replay.pipeline import PipelineTimes
 from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import Trace
@@ -366,8 +367,8 @@ def _run(jobs: Sequence[_Job], schedules: Schedules, repetition: Ints) -> RunBat
         for job, calls in zip(jobs, of_run)
     ]
     tables, which = distinct(used)
-    lengths = [len(each.recording) for each in tables]
-    row = np.repeat((np.cumsum(lengths) - lengths)[which], np.diff(schedules.offsets))
+    lengths = np.array([len(each.recording) for each in tables], np.int64)
+    row: Ints = np.repeat((np.cumsum(lengths) - lengths)[which], np.diff(schedules.offsets))
     row += schedules.frames
     boxes = np.concatenate([each.recording.boxes for each in tables]).take(row, axis=0)
     absent = np.isnan(boxes[:, 0])
@@ -442,6 +443,8 @@ class Runs:
             :func:`replay_sequence`), and gap passes.
         search: the model of where the tracker finds its target; None for none.
         forget_arrivals: let all frames arrive evenly, whatever the traces say of it.
+        pipeline: stages around the tracker, by whose queues it takes frames rather than by the
+            policy; ``source`` is that of the tracker's times. None for the tracker alone.
 
     Raises:
         LaeError: if two passes have the same stride or one is a real-time trace, or the trace or
@@ -466,6 +469,7 @@ class Runs:
     passes: tuple[Trace, ...] = ()
     search: SearchModel | None = None
     forget_arrivals: bool = False
+    pipeline: PipelineTimes | None = None
 
     def __post_init__(self) -> None:
         if self.trace.metadata.kind == "restarts":
@@ -520,7 +524,8 @@ class Runs:
     def batches(self) -> Iterator[RunBatch]:
         """The runs in batches, as many as are scheduled at once."""
         for jobs, services in self._groups():
-            yield from _replayed(jobs, services, self.policy, np.zeros(len(jobs), np.int64))
+            none = np.zeros(len(jobs), np.int64)
+            yield from _replayed(jobs, services, self.policy, none, self.pipeline)
 
     def _groups(self) -> Iterator[tuple[list[_Job], list[Service]]]:
         """Jobs with their services, as many as can be scheduled at once and be in memory.
@@ -642,13 +647,25 @@ class Repetitions:
                     for job, rows in zip(jobs, drawn)
                 ]
                 repetition = np.repeat(np.array(some), len(jobs))
-                yield from _replayed(jobs * len(some), times, self.runs.policy, repetition)
+                yield from _replayed(
+                    jobs * len(some), times, self.runs.policy, repetition, self.runs.pipeline
+                )
 
 
 def _replayed(
-    jobs: Sequence[_Job], services: Sequence[Service], policy: Policy, repetition: Ints
+    jobs: Sequence[_Job],
+    services: Sequence[Service],
+    policy: Policy,
+    repetition: Ints,
+    pipeline: PipelineTimes | None = None,
 ) -> Iterator[RunBatch]:
     """The runs of some jobs, which have a service and a repetition each."""
+    if pipeline is not None:
+        for job, service, number in zip(jobs, services, repetition.tolist()):
+            with explained(f"sequence {job.recording.name!r}: pipeline"):
+                schedule = pipeline.schedule(job.times, job.clock, service, number)
+            yield _run([job], Schedules.of([schedule]), np.array([number]))
+        return
     clocks = [job.clock for job in jobs]
     schedules = simulate_many([len(job) for job in jobs], clocks, services, policy)
     begin = 0

@@ -7,7 +7,7 @@ again, and one whose input has changed is not. Cells of the same replay are comp
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -28,9 +28,10 @@ from lae_sim.forecast.base import AnyFactory
 from lae_sim.forecast.costs import cost_notes
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import RandomSource
-from lae_sim.replay.run import Run, replay_repeated
+from lae_sim.replay.names import kind_of, label_of
+from lae_sim.replay.run import Repetitions, Run
 from lae_sim.replay.search import SearchModel
-from lae_sim.replay.world import World, kind_of, label_of
+from lae_sim.replay.world import World
 from lae_sim.study.rows import CellRows, RowsFile
 from lae_sim.study.spec import is_random
 from lae_sim.trace.file import Trace, held, read_trace
@@ -99,7 +100,7 @@ class Setting:
     @property
     def policy(self) -> str:
         """The policy as the study names it."""
-        return label_of(self.world.policy)
+        return self.world.policy_label
 
     @property
     def latency(self) -> str:
@@ -264,20 +265,12 @@ def _computed(
     costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
     writers = [CellRows(world.sigmas, cell.about(trace.metadata), shared) for cell in cells]
     replay = replayed(setting, trace)
-    repetitions: list[int] = []
-
-    def runs() -> Iterator[Run]:
-        for repetition, run in replay.runs:
-            repetitions.append(repetition)
-            yield run
-
     curves, modelled, kept = CurveTotals(), ModelledTotals(0), []
     departures = calls = 0
     for part in evaluate_groups(
-        runs(), trace.metadata, chosen, world.sigmas, convention, costs=costs, frames=GROUP
+        replay.runs, trace.metadata, chosen, world.sigmas, convention, costs=costs, frames=GROUP
     ):
-        of_part = np.array(repetitions[: len(part.replay.sequences)], np.int32)
-        del repetitions[: len(part.replay.sequences)]
+        of_part = part.replay.repetition.astype(np.int32)
         for f, writer in enumerate(writers):
             writer.add(part, f, of_part)
         curves.add(part)
@@ -350,14 +343,14 @@ class Replayed:
     """The runs of a setting.
 
     Attributes:
-        runs: repetition and run, as they are made.
+        runs: of all repetitions.
         engine: ``"batch"``, or ``"simpy"`` where the policy or the source of times knows no lanes.
         times: metadata of the trace that the times are from.
         search: the model of where the tracker finds its target; None if there is none.
         notes: on when frames arrive.
     """
 
-    runs: Iterable[tuple[int, Run]]
+    runs: Iterable[Run]
     engine: str
     times: Metadata
     search: SearchModel | None
@@ -376,8 +369,8 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
     runs = setting.world.replay(trace, pre_forecaster=searches)
     times = runs.source(next(iter(runs.times)))
     in_lanes = batchable([times], runs.policy) and runs.arrivals != "recorded"
-    made: Iterable[tuple[int, Run]] = ((0, run) for run in runs)
+    made: Iterable[Run] = runs
     if isinstance(runs.source, RandomSource):
-        made = replay_repeated(runs, setting.count, setting.first)
+        made = Repetitions(runs, setting.count, setting.first)
     engine = "batch" if in_lanes else "simpy"
     return Replayed(made, engine, runs.times.metadata, runs.search, runs.notes())

@@ -26,11 +26,11 @@ from lae_sim.replay.latency import (
     resampled,
     scaled,
 )
-from lae_sim.replay.run import Run, Runs, replay_repeated, replay_sequence
+from lae_sim.replay.run import Repetitions, Run, Runs, grouped, replay_repeated, replay_sequence
 from lae_sim.replay.world import replay_trace
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
-from lae_sim.trace.recording import Recording
+from lae_sim.trace.recording import BESIDE, Recording, batched
 
 NAMES = [f"s{i:02}" for i in range(12)]
 EVERY = Metadata.new("30", "every-frame")
@@ -157,3 +157,19 @@ def test_repetitions_come_one_after_another() -> None:
     assert list(replay_repeated(runs, 0)) == []
     with pytest.raises(LaeError, match="only random times can be drawn again"):
         next(replay_repeated(replay_trace(TRACE), 2))
+
+
+@pytest.mark.parametrize("frames", [1, 90, 150, 10**6])
+@pytest.mark.parametrize("lane_frames", [1, 700, 1 << 21])
+def test_batches_are_grouped_as_runs_are(
+    frames: int, lane_frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "_LANE_FRAMES", lane_frames)
+    repeated = Repetitions(replay_trace(TRACE, latency=bootstrap(7)), 3, 2)
+    found = list(grouped(repeated, frames))
+    expected = list(batched(list(repeated), frames, BESIDE))
+    assert [[fields(each) for each in batch] for batch in found] == [
+        [fields(each) for each in group] for group in expected
+    ]
+    drawn = [r for batch in found for r in batch.repetition.tolist()]
+    assert drawn == [r for r, _ in replay_repeated(repeated.runs, 3, 2)]

@@ -46,7 +46,7 @@ def pair(a: Member, b: Member, seed: int):
         return None
     differences = one.mean(axis=0) - other.mean(axis=0)
     [margins] = bootstrap.means(differences[None])
-    found = bootstrap.compare(differences, 0.0, margins, 0.0)
+    [found] = bootstrap.differences(differences[None], 0 * differences[None], [margins], [0.0])
     here = np.nan
     if len(one) > 1 or len(other) > 1:
         margins = drawn_margins(one, other, bootstrap)
