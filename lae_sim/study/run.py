@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
 from lae_sim._compiled import amount
+from lae_sim.comparison.pairs import Pairs
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.caveats import at_the_floor, floor_notes
 from lae_sim.files import check_distinct, csv_cell, text_digest, written_whole
@@ -26,7 +27,6 @@ from lae_sim.study.cells import Result, Task
 from lae_sim.study.comparisons import PairsFile, Rivals, rivals_of
 from lae_sim.study.deployment import Curve, Search, requirement, searches
 from lae_sim.study.executors import RunAll, at_work, cores, run_here
-from lae_sim.study.pairs import Pairs
 from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import MEAN, Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study

@@ -380,6 +380,7 @@ def _warnings(report: Report, metadata: Metadata) -> Iterator[str]:
     taken = device.get("readings", {})
     warnings = gathered(  # whatever another program wrote there
         busy=lambda: _busy(taken["before"]["load"][0], device["cpu"]),
+        threads=lambda: _beyond(metadata.document["timing"]),
         throttled=lambda: throttling(
             taken.get("before", {}),
             taken.get("during", []),
@@ -406,6 +407,14 @@ def _left(load: Mapping[str, Any]) -> str | None:
         return None
     there = f"it was there for {load['sequences']} of {load['of_sequences']} sequences"
     return f"{load['command']!r} ended by itself after {load['seconds']:.3g} s: {there}"
+
+
+def _beyond(timing: Mapping[str, Any]) -> str | None:
+    """Whether the tracker used more cores than it was asked to."""
+    asked, used = timing["threads"]["asked"], timing["cpu_share"]
+    if used <= 1.1 * asked:
+        return None
+    return f"--threads {asked} was not obeyed by all libraries: {used:.2g} cores were busy"
 
 
 def _busy(load: float, cpu: Mapping[str, Any]) -> str | None:

@@ -25,6 +25,7 @@ from restarted import gap_pass
 import lae_sim
 from lae_sim.cli.study import main
 from lae_sim.comparison.forecasters import score_forecasters
+from lae_sim.comparison.pairs import Pairs
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.forecast.learned import write_learned
@@ -33,7 +34,6 @@ from lae_sim.replay.latency import bootstrap, by_frame, constant, scaled
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study import rows as cell_rows
 from lae_sim.study.comparisons import Rivals
-from lae_sim.study.pairs import Pairs
 from lae_sim.study.run import StudyResults, compute_study, flat_rows
 from lae_sim.study.spec import Study
 
