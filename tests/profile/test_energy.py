@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,9 @@ import cv2
 import numpy as np
 import pytest
 from fakes import bright_frame
+from jsonschema import Draft202012Validator
+from places import TRACES
+from schemas import closed
 
 from lae_sim.profile import run as module
 from lae_sim.profile.energy import of_device
@@ -97,6 +101,11 @@ def test_joules_are_watts_times_the_times_of_the_trace(
     assert energy.joules_per_frame == pytest.approx(8 * seconds(trace) / energy.calls)
     assert energy.joules_above_idle == pytest.approx(5 * seconds(trace) / energy.calls)
     told = trace.metadata.document["device"]
+    schema = closed(json.loads((TRACES / "metadata.schema.json").read_text()))
+    Draft202012Validator(schema["properties"]["sequences"] | {"$defs": schema["$defs"]}).validate(
+        trace.metadata.document["sequences"]
+    )
+    Draft202012Validator(schema["properties"]["device"] | {"$defs": schema["$defs"]}).validate(told)
     assert told["clocks"] == {"gpu_mhz": 918.0}
     assert told["slowdowns"] == {"software power cap": 1.0}
     assert "unread" not in told

@@ -9,6 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from places import REPOSITORY
+from schemas import check
 
 from lae_sim.comparison.statistics import Difference, Interval, Recovered
 from lae_sim.figures.study import ENERGY, front
@@ -244,6 +245,7 @@ def test_the_energy_of_calls_is_told_where_their_power_was_measured(measured):
     assert rows["slow", 2].energy is None
     assert rows["synthetic-fast", 1].energy is None
     assert "joules_per_frame" not in rows["synthetic-fast", 1].flat()
+    check(measured.document(), "study")
 
 
 def test_the_front_of_energy_stands_beside_that_of_time(measured):
