@@ -1,8 +1,9 @@
 """Sensors read in the background while a tracker runs, and what they say of its calls.
 
-Power and clocks are integrated over the time of the calls alone: between two readings a counter of
-energy grows evenly, and what is no counter goes straight from one to the other. The pauses between
-readings vary, so that they do not fall in step with the frames.
+What a device takes between calls, when frames are decoded, is told apart from what it takes during
+them. Of a power or a clock that is read now and then, the readings during calls count. Of a counter
+of energy, each step is part of both: the two powers are those that explain the steps best. The
+pauses between readings vary, so that they do not fall in step with the frames.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from types import TracebackType
 
 import numpy as np
 
-from lae_sim._arrays import Floats, Ints
+from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.profile.sensors import Sensor, attempt
 
 INTERVAL_S = 0.05
@@ -31,6 +32,12 @@ GAP_S = 2.0
 
 PATIENCE_S = 1.0
 """How long a reading may take before nobody waits for it any more."""
+
+FEWEST = 5
+"""Readings, or steps of a counter, that are enough to tell calls and pauses apart."""
+
+ALIKE_S = 0.002
+"""How precisely the time of a counter's value is known: some are renewed as rarely."""
 
 LEAST_COVER = 0.5
 """A mean is told if its sensor answered during so much of the time."""
@@ -168,7 +175,7 @@ def mean_over(spans_ns: Ints, at_ns: Ints, read: Floats, sensor: Sensor) -> floa
     """The mean of a sensor over spans of time; None where it was not read during half of it.
 
     Args:
-        spans_ns: beginnings and ends, int64 [n, 2].
+        spans_ns: beginnings and ends, ascending, int64 [n, 2].
         at_ns: when it was read, ascending, int64 [k].
         read: what it said, float64 [k], NaN where nothing.
         sensor: the sensor.
@@ -185,14 +192,49 @@ def mean_over(spans_ns: Ints, at_ns: Ints, read: Floats, sensor: Sensor) -> floa
     else:
         grown = (read[1:] + read[:-1]) / 2 * seconds
         known = seconds < GAP_S
-    covered = _within(spans_ns, at_ns, np.where(known, seconds, 0.0))
-    if covered <= LEAST_COVER * float(np.diff(spans_ns).sum()) / 1e9:
+    during = _within(spans_ns, at_ns) * known
+    if during.sum() <= LEAST_COVER * float(np.diff(spans_ns).sum()) / 1e9:
         return None
-    return _within(spans_ns, at_ns, np.where(known, grown, 0.0)) / covered
+    if sensor.counts:
+        here = known & (during > 0)
+        if np.count_nonzero(here) >= FEWEST:
+            return _rate_during(grown[here], during[here], (seconds - during)[here])
+    else:
+        inside = read[_are_within(spans_ns, at_ns)]
+        if len(inside) >= FEWEST:
+            return float(inside.mean())
+    rates = np.where(known, grown, 0.0) / np.where(seconds > 0, seconds, 1.0)
+    return float(rates @ during / during.sum())  # too few to tell calls and pauses apart
 
 
-def _within(spans_ns: Ints, at_ns: Ints, grown: Floats) -> float:
-    """What has grown by so much from each reading to the next, as far as it lies in the spans."""
-    so_far = np.concatenate([[0.0], np.cumsum(grown)])
-    begun, ended = np.interp(spans_ns.T - at_ns[0], at_ns - at_ns[0], so_far)
-    return float((ended - begun).sum())
+def _rate_during(grown: Floats, during: Floats, between: Floats) -> float:
+    """The rate during calls that, with one between them, explains best what has grown.
+
+    Least squares, neither rate below 0; where steps cannot tell the two apart, they are alike
+    (a ridge, as of Hoerl and Kennard, 1970, on their difference).
+
+    Args:
+        grown: from each reading to the next, float64 [k].
+        during, between: how many of the seconds from each to the next were calls, or not.
+    """
+    calls, pauses = during @ during + ALIKE_S**2, between @ between + ALIKE_S**2
+    both = during @ between - ALIKE_S**2
+    of_calls, of_pauses = grown @ during, grown @ between
+    if of_pauses * calls < of_calls * both:  # less than nothing between calls
+        return float(of_calls / calls)
+    return max(0.0, float((of_calls * pauses - of_pauses * both) / (calls * pauses - both**2)))
+
+
+def _within(spans_ns: Ints, at_ns: Ints) -> Floats:
+    """How much of the time from each reading to the next lies in the spans, s, float64 [k - 1]."""
+    start = at_ns[0]
+    ends = np.concatenate([[0], np.cumsum(spans_ns[:, 1] - spans_ns[:, 0])])
+    edges = (spans_ns - start).ravel()
+    so_far = np.interp(at_ns - start, edges, np.repeat(ends, 2)[1:-1])
+    return np.diff(so_far) / 1e9
+
+
+def _are_within(spans_ns: Ints, at_ns: Ints) -> Bools:
+    """Which readings were made during the spans."""
+    inside: Bools = np.searchsorted(spans_ns.ravel(), at_ns, side="right") % 2 == 1
+    return inside

@@ -34,7 +34,7 @@ def over(
     return mean_over(spans_ns, (at * S).astype(np.int64), values, of)
 
 
-def test_power_goes_straight_from_reading_to_reading() -> None:
+def test_of_few_readings_power_goes_straight_from_one_to_the_next() -> None:
     ramp = [(0.0, 0.0), (1.0, 10.0)]
     assert over([(0, 1)], ramp) == pytest.approx(5)
     assert over([(0, 0.5), (0.5, 1)], ramp) == pytest.approx(5)
@@ -69,25 +69,35 @@ def test_a_sensor_that_failed_is_told_where_it_was_read_half_of_the_time() -> No
 
 
 @given(
-    st.lists(st.floats(0.001, 0.5), min_size=4, max_size=30),
-    st.lists(st.floats(0, 50), min_size=30, max_size=30),
-    st.lists(st.floats(0, 1), min_size=2, max_size=12, unique=True),
+    st.lists(st.tuples(st.floats(0.002, 0.3), st.floats(0.002, 0.3)), min_size=8, max_size=30),
+    st.floats(0, 50),
+    st.floats(0, 50),
+    st.integers(0, 2**32),
 )
-def test_a_power_and_the_counter_of_its_energy_agree(
-    pauses: list[float], power: list[float], ends: list[float]
+def test_what_is_taken_between_calls_is_told_apart(
+    work: list[tuple[float, float]], during: float, between: float, seed: int
 ) -> None:
-    at = np.cumsum(pauses)
-    watts = np.array(power[: len(at)])
-    joules = np.concatenate([[0], np.cumsum((watts[1:] + watts[:-1]) / 2 * np.diff(at))])
-    places = np.sort(at[0] + np.array(ends[: len(ends) // 2 * 2]) * (at[-1] - at[0]))
-    spans = [(a, b) for a, b in places.reshape(-1, 2).tolist() if b - a > 1e-6]
-    if not spans:
-        return
-    found = over(spans, list(zip(at, watts)))
-    wrapped = sensor(counts=True, wraps_at=40.0)
-    counted = over(spans, list(zip(at, joules % 40)), wrapped)
-    assert found == pytest.approx(counted, abs=1e-4)
-    assert watts.min() - 1e-4 <= found <= watts.max() + 1e-4
+    """A device of two powers; that of calls is found whatever the other is."""
+    edges = np.cumsum(np.array(work).ravel())  # pause, call, pause, call ...
+    spans = edges.reshape(-1, 2)
+    chance = np.random.default_rng(seed)
+    at = np.concatenate([[0.0], np.sort(chance.uniform(0, edges[-1], 40)), edges[-1:]])
+    in_call = np.searchsorted(edges, at, side="right") % 2 == 1
+    called = [np.clip(t - spans[:, 0], 0, np.diff(spans)[:, 0]).sum() for t in at]
+    joules = np.maximum.accumulate(between * at + (during - between) * np.array(called))
+    wrapped = sensor(counts=True, wraps_at=2000.0)
+    found = over(spans.tolist(), list(zip(at, joules % 2000)), wrapped)
+    assert found == pytest.approx(during, abs=0.01 * abs(during - between) + 1e-6)
+    if in_call.sum() >= 5:
+        power = np.where(in_call, during, between)
+        assert over(spans.tolist(), list(zip(at, power))) == pytest.approx(during)
+
+
+def test_steps_that_are_alike_are_told_as_they_are() -> None:
+    """Nothing says how calls and pauses share in them, but that both were there."""
+    spans = [(t + 0.25, t + 0.75) for t in range(10)]
+    steps = [(t, 8.0 * t) for t in range(11)]
+    assert over(spans, steps, sensor(counts=True)) == pytest.approx(8)
 
 
 def test_a_thread_reads_until_the_end() -> None:
