@@ -11,8 +11,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import pytest
 from command_line import command, run_here
+from fakes import bright_frame
 from places import REPOSITORY
 
 from lae_sim.errors import LaeError
@@ -109,15 +111,13 @@ def test_one_that_ends_early_is_told(tmp_path: Path) -> None:
 
 
 def test_what_a_load_prints_is_not_kept_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(beside, "KEPT_BYTES", 1000)
-    with Loads(["while true; do echo 0123456789; done"]) as loads:
-        printed = loads._loads[0].printed
-        for _ in range(50):
-            loads.watch()
-        assert eventually(lambda: os.fstat(printed.fileno()).st_size > 1000)
+    monkeypatch.setattr(beside, "KEPT_BYTES", 100)
+    with Loads(["while true; do echo 0123456789; sleep 0.02; done"]) as loads:
+        printed = loads._loads[0].printed.fileno()
+        assert eventually(lambda: os.fstat(printed).st_size > 100)
         loads.watch()
-        # what is printed meanwhile comes on top
-        assert eventually(lambda: bool(loads.watch()) or os.fstat(printed.fileno()).st_size < 1000)
+        assert os.fstat(printed).st_size < 100
+        assert eventually(lambda: os.fstat(printed).st_size > 0)  # it goes on at the beginning
 
 
 def test_parts_of_a_profile_add_up() -> None:
@@ -127,47 +127,64 @@ def test_parts_of_a_profile_add_up() -> None:
     assert in_all([[here, here], [here, gone]])[0] == {**here, "sequences": 2, "of_sequences": 2}
 
 
-def test_a_profile_beside_two_loads(tmp_path: Path) -> None:
-    flag, file = tmp_path / "ran", tmp_path / "load"
-    loud = (
-        f"echo noise; echo noise >&2; echo $$ >{file}; while true; do touch {flag}; sleep 0.1; done"
+@pytest.fixture
+def quick(tmp_path: Path) -> tuple[str, ...]:
+    """Options of a profile of few frames, whose calls wait for a file if there is to be one."""
+    (tmp_path / "data/race/img").mkdir(parents=True)
+    for i in range(4):
+        cv2.imwrite(str(tmp_path / f"data/race/img/{i + 1:04}.png"), bright_frame(5 + 2 * i, 20))
+    boxes = [f"{5 + 2 * i},20,12,10\n" for i in range(4)]
+    (tmp_path / "data/race/groundtruth_rect.txt").write_text("".join(boxes))
+    (tmp_path / "patient.py").write_text(
+        "import os, time\n"
+        "class Patient:\n"
+        "    def __init__(self, file): self.file = file\n"
+        "    def init(self, frame, box): self.box = box\n"
+        "    def track(self, frame):\n"
+        "        while not os.path.exists(self.file): time.sleep(0.01)\n"
+        "        time.sleep(0.1)\n"
+        "        return self.box\n"
     )
-    done = run_here(
-        "profile", "--sequence", "race", "--in-process", "--out", "t.parquet", "--json",
-        "--beside", loud, "sleep 100", cwd=tmp_path,
-    )  # fmt: skip
+    tracker = ("--tracker", "patient:Patient", "--option", f"file={tmp_path / 'flag'}")
+    return (*tracker, "--root", "data", "--in-process", "--warmup", "0", "--out", "t.parquet")
+
+
+def test_a_profile_beside_two_loads(tmp_path: Path, quick: tuple[str, ...]) -> None:
+    file = tmp_path / "load"
+    loud = f"echo noise; echo noise >&2; echo $$ >{file}; while :; do touch flag; sleep 0.1; done"
+    loads = ("--beside", loud, "sleep 100")
+    done = run_here("profile", *quick, "--json", *loads, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "noise" not in done.stdout + done.stderr
     assert json.loads(done.stdout)["failures"] == []
-    assert flag.exists()
     assert not alive(file)
-    loads = read_trace(tmp_path / "t.parquet").metadata.document["device"]["beside"]
+    told = read_trace(tmp_path / "t.parquet").metadata.document["device"]["beside"]
     known = {"exit": None, "seconds": None, "sequences": 1, "of_sequences": 1}
-    assert loads == [{"command": loud, **known}, {"command": "sleep 100", **known}]
+    assert told == [{"command": loud, **known}, {"command": "sleep 100", **known}]
     assert "  beside     sleep 100" in run_here("show", tmp_path / "t.parquet").stdout
 
 
-def test_a_profile_says_that_its_load_left(tmp_path: Path) -> None:
-    quick = ("--sequence", "race", "--in-process", "--out", "t.parquet")
-    done = run_here("profile", *quick, "--beside", "sleep 0.4; exit 2", cwd=tmp_path)
+def test_a_profile_says_that_its_load_left(tmp_path: Path, quick: tuple[str, ...]) -> None:
+    done = run_here("profile", *quick, "--beside", "sleep 0.4; touch flag; exit 2", cwd=tmp_path)
     assert done.returncode == 0
-    assert "'sleep 0.4; exit 2' ended by itself after 0." in done.stderr
+    assert "'sleep 0.4; touch flag; exit 2' ended by itself after 0." in done.stderr
     (load,) = read_trace(tmp_path / "t.parquet").metadata.document["device"]["beside"]
     assert (load["exit"], load["sequences"], load["of_sequences"]) == (2, 0, 1)
     shown = " ".join(run_here("show", tmp_path / "t.parquet").stdout.split())
-    assert "'sleep 0.4; exit 2' ended by itself" in shown
+    assert "'sleep 0.4; touch flag; exit 2' ended by itself" in shown
     assert "it was there for 0 of 1 sequences" in shown
 
 
-def test_a_profile_whose_load_fails_leaves_nothing(tmp_path: Path) -> None:
-    quick = ("--sequence", "race", "--in-process", "--out", "t.parquet")
+def test_a_profile_whose_load_fails_leaves_nothing(tmp_path: Path, quick: tuple[str, ...]) -> None:
+    before = {*tmp_path.iterdir()}
     failed = run_here("profile", *quick, "--beside", "exit 5", cwd=tmp_path)
     assert failed.returncode == 2
     assert failed.stderr == (
         "lae-sim profile: error: beside 'exit 5': it ended at once (status 5): it must run as long "
         "as the profile\n"
     )
-    assert not list(tmp_path.iterdir())
+    left = {each for each in tmp_path.iterdir() if each.name != "__pycache__"}
+    assert left == before
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
