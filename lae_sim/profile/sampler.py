@@ -231,7 +231,8 @@ def _within(spans_ns: Ints, at_ns: Ints) -> Floats:
     ends = np.concatenate([[0], np.cumsum(spans_ns[:, 1] - spans_ns[:, 0])])
     edges = (spans_ns - start).ravel()
     so_far = np.interp(at_ns - start, edges, np.repeat(ends, 2)[1:-1])
-    return np.diff(so_far) / 1e9
+    seconds: Floats = np.diff(so_far) / 1e9
+    return seconds
 
 
 def _are_within(spans_ns: Ints, at_ns: Ints) -> Bools:
