@@ -167,6 +167,8 @@ class Sampler:
                 self.readings += 1
                 self._wanted.clear()
                 self._fresh.notify_all()
+            if self._ended:  # said before it was wanted, which is forgotten now
+                return
             pause = self.interval_s * chance.uniform(0.5, 1.5)
             self._wanted.wait(max(pause, (time.thread_time() - start) / SHARE))
 
