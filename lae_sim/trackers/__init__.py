@@ -5,6 +5,7 @@ whatever the tracker itself needs. Of the package they import this folder and ``
 alone.
 """
 
+from lae_sim.trackers.masks import box_of
 from lae_sim.trackers.stages import stage
 
-__all__ = ["stage"]
+__all__ = ["box_of", "stage"]

@@ -15,15 +15,52 @@ import socket
 import struct
 import subprocess
 import tempfile
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Mapping
 
 import numpy as np
 
 from lae_sim.errors import LaeError, install
+from lae_sim.trackers.masks import box_of
 from lae_sim.trackers.protocol import Box, Image, Output
 
 FOLDER = "lae-sim-trax-"
 PATIENCE_S = 1.0
+
+
+def trax_program(command: str, **parameters: Any) -> Trax:
+    """A program that speaks TraX, by its command.
+
+    Args:
+        command: the program and its arguments, as in a shell but without one; ``env X=1 command``
+            sets a variable.
+        parameters: given to the program at each initialisation, as text.
+
+    Raises:
+        LaeError: as of `Trax`.
+    """
+    return Trax(Program(f"trax:{command}", command), parameters)
+
+
+@dataclass(frozen=True)
+class Program:
+    """How a program that speaks TraX is started.
+
+    Attributes:
+        name: what messages call it.
+        command: the program and its arguments, as in a shell but without one.
+        environment: variables beside those of this process.
+        folder: where it runs; None is the current one.
+        lasting: whether it can take more than one sequence.
+        facts: what is said of it in a trace, such as its version.
+    """
+
+    name: str
+    command: str
+    environment: Mapping[str, str] = field(default_factory=dict)
+    folder: str | None = None
+    lasting: bool = True
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Trax:
@@ -35,25 +72,24 @@ class Trax:
     its tracker has seen the first frame, so ``init`` has it track that frame once.
 
     Args:
-        command: the program and its arguments, as in a shell but without one; ``env X=1 command``
-            sets a variable.
+        program: how it is started.
         parameters: given to the program at each initialisation, as text.
 
     Raises:
-        LaeError: if the command does not start, or ends without speaking TraX; by each method, if
+        LaeError: if the program does not start, or ends without speaking TraX; by each method, if
             the program ends. The next ``init`` then starts it again.
     """
 
-    def __init__(self, command: str, **parameters: Any) -> None:
+    def __init__(self, program: Program, parameters: Mapping[str, Any]) -> None:
         try:
             import trax.client
         except ImportError as error:
             raise LaeError(f"TraX is missing ({error}): {install('trax')}") from error
         self._trax: Any = trax
-        self._command = command
+        self._program = program
         self._parameters = {name: str(value) for name, value in parameters.items()}
         self._client: Any = None
-        self._fresh, self._lasting = False, True
+        self._fresh, self._lasting = False, program.lasting
         self._session = contextlib.ExitStack()
         self._folder = _folder()
         self._bitmaps: list[tuple[str, Any]] = []
@@ -90,7 +126,7 @@ class Trax:
     def track(self, frame: Image) -> Output:
         """Find the target in the next frame."""
         if self._client is None:
-            raise LaeError(f"trax:{self._command} must be initialised first")
+            raise LaeError(f"{self._program.name} must be initialised first")
         region, properties = self._ask(self._client.frame, self._hand_over(frame), {}, [])
         box = _box(region)
         try:
@@ -102,9 +138,12 @@ class Trax:
         """What the program says of itself, and how it was started."""
         from importlib.metadata import version
 
+        facts = dict(self._program.facts)
+        settings = {"command": self._program.command, **facts.pop("settings", {})}
         return {
             **self._description,
-            "settings": {"command": self._command, **self._parameters},
+            **facts,
+            "settings": {**settings, **self._parameters},
             "libraries": {"trax": version("vot-trax")},
         }
 
@@ -122,14 +161,20 @@ class Trax:
             self._log = self._session.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
             try:
                 self._process = subprocess.Popen(
-                    shlex.split(self._command),
+                    shlex.split(self._program.command),
+                    cwd=self._program.folder,
                     stdin=subprocess.DEVNULL,
                     stdout=self._log,
                     stderr=self._log,
-                    env={**os.environ, "TRAX": "1", "TRAX_SOCKET": port},
+                    env={
+                        **os.environ,
+                        **self._program.environment,
+                        "TRAX": "1",
+                        "TRAX_SOCKET": port,
+                    },
                 )
             except (OSError, ValueError, IndexError) as error:
-                raise LaeError(f"trax:{self._command} does not start: {error}") from error
+                raise LaeError(f"{self._program.name} does not start: {error}") from error
             self._session.callback(_end, self._process)
             while not select.select([listener], [], [], 0.05)[0]:
                 if self._process.poll() is not None:
@@ -180,7 +225,7 @@ class Trax:
         lines = self._log.read().decode(errors="replace").split("\n")
         printed = [line.strip() for line in lines if line.strip()]
         self._end()
-        return LaeError(": ".join([f"trax:{self._command}", reason, *printed[-1:]]))
+        return LaeError(": ".join([self._program.name, reason, *printed[-1:]]))
 
     def _end(self) -> None:
         self._client = None
@@ -203,9 +248,12 @@ def _box(region: Any) -> tuple[float, float, float, float] | None:
     elif region.type == "polygon":
         points = np.array(list(region))
         (x, y), (w, h) = points.min(axis=0), np.ptp(points, axis=0)
-    elif region.type == "mask" and region.array().any():
-        points = np.argwhere(region.array())[:, ::-1] + region.offset()
-        (x, y), (w, h) = points.min(axis=0), np.ptp(points, axis=0) + 1
+    elif region.type == "mask":
+        within = box_of(region.array())
+        if within is None:
+            return None
+        (left, top), (x, y, w, h) = region.offset(), within
+        x, y = x + left, y + top
     else:
         return None
     return (float(x), float(y), float(w), float(h)) if w > 0 and h > 0 else None
