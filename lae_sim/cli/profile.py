@@ -88,7 +88,7 @@ def parser() -> argparse.ArgumentParser:
         "--frame-timeout",
         type=argument(parse_duration),
         metavar="TIME",
-        help="give a sequence up when a call takes longer (default: 30s, or the registry's timeout)",
+        help="give a sequence up when a call takes longer (default: 30s or the registry's)",
     )
     add(
         "--warmup",

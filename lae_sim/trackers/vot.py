@@ -32,6 +32,7 @@ INI = "trackers.ini"
 PROTOCOLS = ("trax", "traxpython")
 
 _MODULE = re.compile(r"[a-zA-Z_][a-zA-Z0-9_.]*")
+_SECONDS = re.compile(r"0*[1-9][0-9]{0,8}")
 _YES = ("true", "1", "t", "y", "yes")
 
 
@@ -119,7 +120,7 @@ class Entry:
         value = self.values.get("timeout")
         if value is None:
             return None
-        if not (value.isascii() and value.isdigit() and int(value) > 0):
+        if not _SECONDS.fullmatch(value):
             raise self._wrong(f"timeout: {shown(value)} is no whole number of seconds from 1")
         return int(value)
 
