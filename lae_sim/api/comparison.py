@@ -29,7 +29,8 @@ from lae_sim.files import sequence_names
 from lae_sim.learning.registry import COMPARED, load_any, load_forecaster
 from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.latency import LatencySource
-from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, label_of, named, open_others
+from lae_sim.replay.names import label_of, named
+from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, open_others
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

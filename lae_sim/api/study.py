@@ -18,7 +18,7 @@ from lae_sim.figures.study import study_in_columns
 from lae_sim.files import text_digest, written_whole
 from lae_sim.plugins import looking_in
 from lae_sim.progress import ProgressBar, ShowProgress
-from lae_sim.replay.world import named
+from lae_sim.replay.names import named
 from lae_sim.report.page import page_drawings, page_of, page_sections
 from lae_sim.report.paper import Paper, remove_paper, write_paper, written_before
 from lae_sim.report.study_tables import paper_tables
@@ -51,7 +51,8 @@ def run_study(
             themselves, such as ``traces="*.parquet", latencies=["recorded", "bootstrap"]``.
         folder: where results are kept; of a file ``STUDY-results``, else ``study-results``.
             Finished parts found there are not computed again.
-        workers: processes on this machine; by default one for each core. No result depends on it.
+        workers: processes on this machine; by default one for each core, or this one
+            alone where there is little to do. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead.
         report: whether to write ``report.html``, ``figures/`` and ``tables/`` too.
         root: folder of the dataset, for the report to show a few sequences with their images;

@@ -22,7 +22,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Frames, Ints
 from lae_sim._compiled import compiled
 from lae_sim.engine.clock import MAX_INT64, Clock
-from lae_sim.engine.scheduler import Schedule, Schedules
+from lae_sim.engine.scheduler import NEVER, Schedule, Schedules
 from lae_sim.errors import LaeError
 
 MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
@@ -258,7 +258,8 @@ def pair(
     if cost_ns < 0:
         raise LaeError(f"forecasting cannot cost {cost_ns} ns, less than nothing")
     cost = cost_ns * clocks[0].ticks_per_ns
-    last_ready = int(schedules.ready[offsets[1:] - 1].max()) + cost
+    visible = schedules.visible
+    last_ready = int(visible[visible < NEVER].max()) + cost
     if last_ready > MAX_INT64:
         raise LaeError(f"forecasting cannot cost {cost_ns:g} ns: the clock ends before")
     largest = max(last_ready // interval, int(lengths.max())) * scale
@@ -271,7 +272,7 @@ def pair(
     frames = schedules.frames
     overlaps = schedules.start[1:] < schedules.ready[:-1]
     overlaps[offsets[1:-1] - 1] = False
-    if not at_once and overlaps.any():
+    if not at_once and schedules.whole is None and overlaps.any():
         raise LaeError(
             "calls overlap, as under the rule of VOT, which never scores latency: such a policy "
             "says so by an attribute, scores_latency = False"
@@ -280,7 +281,11 @@ def pair(
     steps: Ints | None = None
     next_steps: Ints | None = None
     if all(clock.is_even for clock in set(clocks)):
-        steps = frames * scale if at_once else _steps(schedules.ready + cost, interval, scale)
+        if at_once:
+            steps = frames * scale
+        else:
+            steps = _steps(visible + cost, interval, scale)
+            steps[visible == NEVER] = _NEVER
         steps[offsets[:-1]] = -_NEVER
         next_steps = np.append(steps[1:], _NEVER)
         next_steps[offsets[1:] - 1] = _NEVER
@@ -292,8 +297,8 @@ def pair(
         since = np.array(permitted, np.int64)
         first = np.concatenate(
             [
-                _first_arrived(s, s.clock.arrival(s.frames) if at_once else s.ready + cost, since)
-                for s in schedules
+                _first_arrived(s, s.clock.arrival(s.frames) if at_once else seen + cost, since)
+                for s, seen in zip(schedules, np.split(visible, offsets[1:-1]))
             ]
         )
         end = _ends(first, offsets, lengths)

@@ -10,6 +10,8 @@ from .latency import (
     resampled,
     scaled,
 )
+from .names import parse_latency, parse_policy
+from .pipeline import parse_pipeline, parse_time, read_pipeline
 from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
 from .run import Repetitions, Run, RunBatch, Runs, replay_repeated, replay_sequence
 from .search import Outcomes, SearchModel, find_search
@@ -18,8 +20,6 @@ from .world import (
     SIGMA_GRID,
     TraceLike,
     World,
-    parse_latency,
-    parse_policy,
     parse_sigmas,
     replay_trace,
 )
@@ -50,9 +50,12 @@ __all__ = [
     "lognormal",
     "own_jumps",
     "parse_latency",
+    "parse_pipeline",
     "parse_policy",
     "parse_sigmas",
+    "parse_time",
     "phases",
+    "read_pipeline",
     "replay_repeated",
     "replay_sequence",
     "replay_trace",
