@@ -7,8 +7,8 @@ alone.
 What users' own trackers call is here.
 """
 
-from lae_sim.trackers.masks import box_of
 from lae_sim.trackers.onnx import onnx_session
+from lae_sim.trackers.protocol import box_of
 from lae_sim.trackers.stages import stage
 
 __all__ = ["box_of", "onnx_session", "stage"]

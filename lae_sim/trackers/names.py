@@ -24,7 +24,7 @@ _BUILT_IN = {
     "pysot": ("pysot", "PySot"),
     "pytracking": ("pytracking", "PyTracking"),
     "trax": ("trax", "trax_program"),
-    "vot": ("vot", "vot_tracker"),
+    "vot": ("trax", "vot_tracker"),
 }
 _TAKE_ARGUMENT = ("opencv", "trax", "vot")
 
@@ -68,6 +68,6 @@ def usual_timeout(name: str, options: Mapping[str, Any]) -> float:
     kind, _, value = name.partition(":")
     if kind != "vot" or not value:
         return TIMEOUT_S
-    from lae_sim.trackers.vot import INI, find_entry
+    from lae_sim.trackers.trax import INI, find_entry
 
     return find_entry(value, options.get("ini", INI)).timeout or TIMEOUT_S

@@ -21,7 +21,7 @@ from lae_sim.trackers.names import TIMEOUT_S, make_tracker, usual_timeout
 
 pytest.importorskip("trax", reason="TraX is not installed: pip install 'lae-sim[trax]'")
 
-from lae_sim.trackers.vot import find_entry
+from lae_sim.trackers.trax import find_entry
 
 BOX = (10.5, 20.0, 30.0, 8.0)
 FRAME = np.zeros((60, 81, 3), np.uint8)
