@@ -35,7 +35,7 @@ examples:
   lae-sim profile --dataset DTB70 --root ~/data/DTB70 --stride 3/2 2 3
   lae-sim profile --tracker nanotrack --option weights=nanotrackv3 --root ~/data/DTB70
   lae-sim profile --tracker my_package.my_module:MyTracker --option size=small --device cuda:0
-  lae-sim profile --tracker vot:NCC --ini workspace/trackers.ini --dataset DTB70 --root ~/data/DTB70
+  lae-sim profile --tracker vot:NCC --ini workspace/trackers.ini --root ~/data/DTB70
   lae-sim profile --mode real-time --pre-forecaster kalman --timing jetson.parquet
   lae-sim profile --closed-loop constant:47ms constant:100ms --stride 3/2 2 3  then lae-sim fidelity
   lae-sim profile --gaps 10m --stride 2                how far it finds a target from where it was
