@@ -11,6 +11,7 @@ from .latency import (
     scaled,
 )
 from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
+from .recorded import AsRecorded
 from .run import Run, Runs, replay_repeated, replay_sequence
 from .search import Outcomes, SearchModel, find_search
 from .strides import followed, phases
@@ -26,6 +27,7 @@ from .world import (
 
 __all__ = [
     "SIGMA_GRID",
+    "AsRecorded",
     "LatencySource",
     "Outcomes",
     "OwnJump",

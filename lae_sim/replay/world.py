@@ -31,6 +31,7 @@ from lae_sim.replay.latency import (
     time_label,
 )
 from lae_sim.replay.passes import split_passes
+from lae_sim.replay.recorded import RECORDED_POLICY, AsRecorded
 from lae_sim.replay.run import Runs
 from lae_sim.replay.search import find_search, parse_search
 from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
@@ -53,7 +54,7 @@ TraceLike: TypeAlias = "str | os.PathLike[str] | Trace"
 
 Value = TypeVar("Value")
 
-_POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime")
+_POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime", "recorded")
 _LATENCIES = ("recorded", "by-call", "stage", "constant", "resample", "lognormal", "bootstrap")
 
 _TRACES_OWN = (RandomSource, sources.StageTimes)  # sources whose initialisations are the trace's
@@ -416,18 +417,20 @@ def parse_policy(text: str) -> Policy:
         return policies.latest
     if text == "fifo":
         return policies.fifo
+    if text == RECORDED_POLICY:
+        return AsRecorded()
     if name == "every":
         return policies.every(_number(text, value, least=1))
     if name == "shrinking-tail" and value:
         return policies.shrinking_tail(value)
     if name == "vot-realtime":
         return policies.vot_realtime(*([_number(text, value)] if value else []))
-    if colon and name not in ("latest", "fifo", "shrinking-tail"):
+    if colon and name not in ("latest", "fifo", "shrinking-tail", RECORDED_POLICY):
         policy: Policy = _plugin("policy", text, _POLICIES, ("clock", "calls"))
         return policy
     raise LaeError(
         f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
-        f"vot-realtime[:GRACE], package.module:object{hint(name, _POLICIES)}"
+        f"vot-realtime[:GRACE], recorded, package.module:object{hint(name, _POLICIES)}"
     )
 
 

@@ -1,0 +1,491 @@
+"""Measured logs of a running tracker, as traces that replay as they were recorded."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from statistics import median_low
+from typing import Any
+
+import numpy as np
+
+from lae_sim._arrays import Floats, Ints
+from lae_sim.datasets.annotations import read_truth
+from lae_sim.engine.arrivals import with_arrivals
+from lae_sim.engine.clock import NS_PER_SECOND, Clock, Number, parse_fps
+from lae_sim.errors import LaeError, shown
+from lae_sim.importers.convert import ConversionSummary
+from lae_sim.importers.log_table import read_table
+from lae_sim.importers.logs import Box, Log, LoggedOutput, clock_offset, seconds
+from lae_sim.importers.rosbag import SUFFIXES, BagOptions, read_bag
+from lae_sim.replay.recorded import RECORDED_POLICY, AsRecorded
+from lae_sim.replay.run import replay_sequence
+from lae_sim.trace.checks import RowChecker
+from lae_sim.trace.columns import Rows
+from lae_sim.trace.file import Trace
+from lae_sim.trace.metadata import ImageSizes, Metadata
+from lae_sim.trace.recording import Recording
+
+LOG_FORMATS = ("ros", "csv")
+ARRIVALS = ("received", "captured")
+GAPS = ("dropped", "skipped")
+
+
+def log_format(path: Path, wanted: str = "auto") -> str | None:
+    """The format of a log, of :data:`LOG_FORMATS`; None where it looks like results.
+
+    Args:
+        path: a file or folder.
+        wanted: a format by name, or ``"auto"``.
+    """
+    if wanted != "auto":
+        return wanted if wanted in LOG_FORMATS else None
+    if path.is_dir():
+        bags = (path.glob(f"*{suffix}") for suffix in SUFFIXES)
+        return "ros" if (path / "metadata.yaml").exists() or any(map(any, bags)) else None
+    suffix = path.suffix.lower()
+    return "ros" if suffix in SUFFIXES else "csv" if suffix == ".csv" else None
+
+
+def convert_log(
+    log: str | Path,
+    *,
+    format: str = "auto",
+    truth: str | Path | None = None,
+    fps: Number | None = None,
+    init_box: Box | None = None,
+    arrivals: str | None = None,
+    clock_offset: str | None = None,
+    image_topic: str | None = None,
+    box_topic: str | None = None,
+    truth_topic: str | None = None,
+    fields: Mapping[str, str] | None = None,
+    target: str | None = None,
+    match: str | None = None,
+    gaps: str | None = None,
+    skip_missing: bool = False,
+    tracker: str | None = None,
+    device: str | None = None,
+    dataset: str | None = None,
+    image_size: tuple[int, int] | None = None,
+) -> tuple[Trace, ConversionSummary]:
+    """Make a trace from the log of a tracker that ran: a ROS bag, or a table.
+
+    Under the policy ``recorded`` the trace replays as the log says: each output of each frame is
+    ready at the very instant that it has there. A processing time reaches from when the frame had
+    arrived, and the output before was ready, to its own output. Outputs that no query can see, of
+    frames older than one whose output was ready, or begun when the stream had ended, are left out.
+
+    Args:
+        log: a bag's folder or file (see :func:`lae_sim.importers.rosbag.read_bag`), or a table
+            (:func:`lae_sim.importers.log_table.read_table`).
+        format: ``"ros"``, ``"csv"``, or ``"auto"``.
+        truth: a file of ground truth, a row for each frame of the log.
+        fps: nominal frames per second; by default estimated from the median interval.
+        init_box: ``x, y, w, h`` that the tracker was given on the log's first frame. By default the
+            trace begins at the first frame with an output, whose box stands for it.
+        arrivals: when frames arrived: ``"received"``, when the log has received them (default,
+            where it says so), or ``"captured"``, at their capture times.
+        clock_offset: what to add to capture times to have the log's clock, such as ``"-3600s"``, or
+            ``"estimate"``: so much that the quickest frame takes no time. By default the clocks are
+            one.
+        image_topic, box_topic, truth_topic, fields, target, match: of a bag (see
+            :class:`lae_sim.importers.rosbag.BagOptions`).
+        gaps: of a table: what frame numbers that are missing mean, ``"dropped"`` or ``"skipped"``.
+        skip_missing: leave out boxes that belong to no frame.
+        tracker, device, dataset: names in the trace; those of the tracker and the dataset are by
+            default those of the topic and the log.
+        image_size: width and height in pixels, if the log does not say.
+
+    Returns:
+        The trace, and what is to be said of it.
+
+    Raises:
+        LaeError: if something of the log is missing or impossible; it names the file, and the
+            message of a topic or the line.
+
+    Example:
+        >>> import lae_sim, tempfile
+        >>> from pathlib import Path
+        >>> text = '''frame,arrived_ms,ready_ms,x,y,w,h
+        ... 0,0,40,10,20,30,40
+        ... 1,33,,,,,
+        ... 2,67,95.5,12,20,30,40'''
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "flight.csv").write_text(text)
+        ...     trace, summary = lae_sim.convert_log(f"{folder}/flight.csv", fps=30)
+        >>> trace["flight"].elapsed_ns.tolist(), trace["flight"].arrival_ns.tolist()
+        ([40000000, -1, 28500000], [0, 33000000, 67000000])
+        >>> run = lae_sim.replay_sequence(
+        ...     trace["flight"], lae_sim.engine.Clock.at(30), policy=lae_sim.replay.AsRecorded()
+        ... )
+        >>> (run.schedule.ready // run.schedule.clock.ticks_per_ns).tolist()
+        [40000000, 95500000]
+    """
+    if not isinstance(log, (str, os.PathLike)):
+        raise LaeError(f"log: a path, not {shown(log)}")
+    path = Path(log)
+    if not path.exists():
+        raise LaeError(f"{path}: no such file or folder")
+    kind = log_format(path, format)
+    if kind is None:
+        raise LaeError(f"{path}: neither a ROS bag nor a .csv file: say which with --format")
+    for name, value, known in (("arrivals", arrivals, ARRIVALS), ("gaps", gaps, GAPS)):
+        if value is not None and value not in known:
+            raise LaeError(f"{name}: no {shown(value)}: there are {' and '.join(known)}")
+    of_bags = {
+        "image_topic": image_topic,
+        "box_topic": box_topic,
+        "truth_topic": truth_topic,
+        "field": fields,
+        "target": target,
+        "match": match,
+    }
+    if kind == "ros":
+        if gaps is not None:
+            raise LaeError("gaps is of tables, whose frames have numbers")
+        found = read_bag(
+            path,
+            BagOptions(
+                image_topic, box_topic, truth_topic, fields, target, match, clock_offset,
+                skip_missing,
+            ),
+        )
+    else:
+        if given := [name for name, value in of_bags.items() if value]:
+            raise LaeError(f"{path}: {', '.join(given)}: of bags, and this is a table")
+        found = read_table(path, gaps)
+    return _converted(
+        path, kind, found, truth, fps, init_box, arrivals, clock_offset, tracker, device, dataset,
+        image_size,
+    )
+
+
+def _converted(
+    path: Path,
+    kind: str,
+    log: Log,
+    truth: str | Path | None,
+    fps: Number | None,
+    init_box: Box | None,
+    arrivals: str | None,
+    offset: str | None,
+    tracker: str | None,
+    device: str | None,
+    dataset: str | None,
+    image_size: tuple[int, int] | None,
+) -> tuple[Trace, ConversionSummary]:
+    """The trace of a log that has been read."""
+    notes = list(log.notes)
+    facts = dict(log.facts)
+    if not log.frames or not log.outputs:
+        raise LaeError(f"{path}: no {'outputs' if log.frames else 'frames'}")
+    arrived, how = _arrived(path, log, arrivals, offset)
+    facts |= how
+    notes += _clock_notes(facts)
+    known_truth = _truth(log, truth)
+    tracker, name = tracker or log.tracker, path.stem
+    rate = str(fps) if fps is not None else _estimated_rate(path, log, arrived)
+    if fps is None:
+        notes.append(f"{rate} frames/s is estimated, from the median time between frames; --fps")
+    begin = 0 if init_box else _first(path, log.outputs)
+    if begin:
+        notes.append(f"{begin:,} frames before the first output are left out")
+    clock = Clock.at(parse_fps(rate))
+    own = with_arrivals(clock, [at - arrived[begin] for at in arrived[begin:]])
+    timeline = _Timeline.of(log.outputs, arrived, begin, own, init_box)
+    recording = Recording.new(
+        name, known_truth[begin:], timeline.boxes, timeline.elapsed_ns, timeline.score,
+        np.array(arrived[begin:]) - arrived[begin], None, timeline.stages,
+    )
+    RowChecker(str(path), profiled=True)(Rows.of_recordings([recording]))
+    if _differs(recording, clock, timeline):
+        raise LaeError(f"{path}: a replay does not repeat the log")
+    facts["initial_box"] = "given" if init_box else "first output"
+    notes += timeline.notes
+    if not np.isfinite(known_truth[begin:]).any():
+        notes.append("no ground truth: a replay tells of ages and skipped frames, not of scores")
+    timing = {
+        "source": "measured",
+        "clock": "receive times of the bag" if kind == "ros" else "times of the log",
+        "includes": "from when a frame had arrived and the output before was ready to its output",
+        "note": timeline.init_note,
+    }
+    if log.interpolated:
+        timing["note"] += f"; {log.interpolated:,} frames that the log left out arrive at even steps"
+    sizes = log.image_sizes
+    if image_size is not None:
+        entry: dict[str, Any] = {"image_size": list(image_size)}
+    else:
+        entry = _later(sizes, begin).entry() if sizes is not None else {}
+    if timeline.lost:
+        entry["lost"] = timeline.lost
+    metadata = Metadata.new(
+        rate,
+        "real-time",
+        schedule={"policy": RECORDED_POLICY},
+        tracker={"name": tracker},
+        device={"model": device} if device else {},
+        dataset={"name": dataset or name},
+        timing=timing,
+        log=facts,
+        sequences={name: entry},
+    )
+    processed = recording.elapsed_ns[recording.elapsed_ns >= 0]
+    files = [*sorted(each for each in path.iterdir() if each.is_file())] if path.is_dir() else [path]
+    summary = ConversionSummary(
+        format=kind,
+        schedule="real-time",
+        fps=rate,
+        tracker=tracker,
+        dataset=dataset or name,
+        timing=timing,
+        sequences=1,
+        frames=len(recording),
+        processed=len(processed),
+        median_ms=float(np.median(processed)) / 1e6,
+        times_read_as=None,
+        held={name: timeline.lost} if timeline.lost else {},
+        frame_times=None,
+        numbers_missing=[],
+        row_0_from_truth=[],
+        other_trackers=[],
+        without_truth=[],
+        without_results=[],
+        notes=notes,
+        files=[*files, *([Path(truth)] if truth is not None else [])],
+    )
+    return Trace(metadata, [recording]), summary
+
+
+def _arrived(
+    path: Path, log: Log, asked: str | None, offset: str | None
+) -> tuple[list[int], dict[str, Any]]:
+    """When each frame arrived, on the log's clock, and how one knows."""
+    captured = [frame.captured_ns for frame in log.frames]
+    received = [frame.arrived_ns for frame in log.frames]
+    if asked is None:
+        asked = "captured" if all(at is None for at in received) else "received"
+    times, facts = received, {"arrivals": asked}
+    if asked == "captured":
+        times = captured
+    for frame, at in zip(log.frames, times):
+        if at is None:
+            raise LaeError(f"{frame.where}: no time when the frame was {asked}")
+    known = [at for at in times if at is not None]
+    delays = [to - at for to, at in zip(received, captured) if to is not None and at is not None]
+    if asked == "captured":
+        if not delays:  # a frame arrives before its output
+            ready = {output.frame: output.started_ns or output.ready_ns for output in log.outputs}
+            delays = [to - known[frame] for frame, to in ready.items()]
+        found = clock_offset(path, delays, offset)
+        known = [at + found.ns for at in known]
+        facts |= {"clock_offset_ns": found.ns, "clock_offset": found.source}
+    elif delays:
+        facts |= _camera_delay(path, delays, offset)
+    for frame, before, at in zip(log.frames[1:], known, known[1:]):
+        if at <= before:
+            when = "together with" if at == before else f"{seconds(before - at)} before"
+            raise LaeError(
+                f"{frame.where}: {asked} {when} the frame ahead of it: frames come one after another"
+            )
+    return known, facts
+
+
+def _clock_notes(facts: Mapping[str, Any]) -> list[str]:
+    """What is to be said of the clocks, a sentence each."""
+    notes = []
+    if facts.get("clock_offset") == "estimated":
+        notes.append(
+            f"the camera's clock is {facts['clock_offset_ns'] / 1e9:+.9f} s from the log's by the least "
+            "delay: an estimate, which takes the quickest frame to need no time"
+        )
+    elif facts.get("clock_offset") == "unknown":
+        notes.append("the camera's clock is another, so its delay is unknown (--clock-offset)")
+    if facts["arrivals"] == "captured":
+        notes.append("frames arrive when they were captured: ages hold the camera's delay")
+    elif "camera_delay_ns" in facts:
+        delay = facts["camera_delay_ns"]["median"]
+        notes.append(
+            f"frames arrive when the log received them, {seconds(delay)} after capture (median); ages "
+            "count from then"
+        )
+    return notes
+
+
+def _camera_delay(path: Path, delays: Sequence[int], offset: str | None) -> dict[str, Any]:
+    """How long frames took from capture to arrival, as far as the clocks tell."""
+    try:
+        found = clock_offset(path, delays, offset)
+    except LaeError:
+        if offset is not None:
+            raise
+        return {"clock_offset": "unknown"}  # nothing but this delay rests on it
+    own = sorted(delay - found.ns for delay in delays)
+    return {
+        "clock_offset_ns": found.ns,
+        "clock_offset": found.source,
+        "camera_delay_ns": {"least": own[0], "median": median_low(own), "most": own[-1]},
+    }
+
+
+def _truth(log: Log, path: str | Path | None) -> Floats:
+    """Ground truth of every frame, float64 [T, 4]; NaN = none."""
+    if path is None:
+        truth = np.full((len(log.frames), 4), np.nan)
+        for place, box in log.truth.items():
+            truth[place] = box
+        return truth
+    truth = read_truth(Path(path), len(log.frames))
+    if len(truth) != len(log.frames):
+        raise LaeError(
+            f"{path}: {len(truth)} rows of ground truth, and the log has {len(log.frames)} frames"
+        )
+    return truth
+
+
+def _estimated_rate(path: Path, log: Log, arrived: Sequence[int]) -> str:
+    """Frames per second to two decimals, as text, from the median interval."""
+    captured = [frame.captured_ns for frame in log.frames]
+    times = [at for at in captured if at is not None]
+    if len(times) < len(arrived):
+        times = list(arrived)
+    intervals = [to - at for at, to in pairwise(times)]
+    hundredths = round(Fraction(100 * NS_PER_SECOND, max(median_low(intervals), 1))) if intervals else 0
+    if not hundredths:
+        raise LaeError(f"{path}: too few frames to tell their rate: give it by --fps")
+    return f"{hundredths // 100}.{hundredths % 100:02}".rstrip("0").rstrip(".")
+
+
+def _first(path: Path, outputs: Sequence[LoggedOutput]) -> int:
+    """The frame of the first output that has a box."""
+    found = [(output.ready_ns, output.frame) for output in outputs if output.box is not None]
+    if not found:
+        raise LaeError(f"{path}: no output has a box: the tracker found no target")
+    return min(found)[1]
+
+
+def _later(sizes: ImageSizes, begin: int) -> ImageSizes:
+    """The sizes of the images from one frame on."""
+    frames = [begin, *(int(at) for at in sizes.starts if at > begin)]
+    return ImageSizes.of((at - begin for at in frames), map(sizes.at, frames))
+
+
+@dataclass(frozen=True)
+class _Timeline:
+    """A sequence's outputs by frame, as a recording has them.
+
+    Attributes:
+        boxes, elapsed_ns, score, stages: of T frames (see :class:`.recording.Recording`).
+        ready_ns: of each processed frame, after the first arrival.
+        lost: outputs without a box, in whose place the one before stands.
+        init_note: what the time of the initialisation is.
+        notes: what is to be said, a sentence each.
+    """
+
+    boxes: Floats
+    elapsed_ns: Ints
+    score: Floats
+    stages: dict[str, Ints]
+    ready_ns: list[int]
+    lost: int
+    init_note: str
+    notes: list[str]
+
+    @classmethod
+    def of(
+        cls,
+        outputs: Sequence[LoggedOutput],
+        arrived: Sequence[int],
+        begin: int,
+        clock: Clock,
+        init_box: Box | None,
+    ) -> _Timeline:
+        """That of a log.
+
+        Args:
+            outputs: of frames by their places in ``arrived``, in any order.
+            arrived: when each frame arrived, ns.
+            begin: the first frame of the sequence, from whose arrival its times count.
+            clock: of the sequence.
+            init_box: the box of its first frame, unless it is the first output.
+
+        Raises:
+            LaeError: if an output is ready before its frame arrived, or two are of one frame.
+        """
+        length, zero = len(arrived) - begin, arrived[begin]
+        boxes = np.full((length, 4), np.nan)
+        elapsed_ns, queue, call = (np.full(length, -1, np.int64) for _ in range(3))
+        score = np.full(length, np.nan, np.float32)
+        ready_ns: list[int] = []
+        of_frame: dict[int, LoggedOutput] = {}
+        free = lost = overtaken = late = early = overlapping = 0
+        last, box = -1, init_box
+        init_note = "the first output's time stands for that of the initialisation"
+        for output in sorted(outputs, key=lambda output: (output.ready_ns, output.frame)):
+            frame, ready = output.frame - begin, output.ready_ns - zero
+            if frame < 0 or (frame > 0 and last < 0 and box is None):
+                early += 1
+                continue
+            if (other := of_frame.setdefault(output.frame, output)) is not output:
+                raise LaeError(f"{output.where}: a second output of the frame of {other.where}")
+            here = arrived[output.frame] - zero
+            begun = None if output.started_ns is None else output.started_ns - zero
+            if min(ready, ready if begun is None else begun) < here:
+                what = "ready" if ready < here else "started"
+                by = here - (ready if ready < here else begun or 0)
+                raise LaeError(
+                    f"{output.where}: {what} {seconds(by)} before its frame arrived; if the log "
+                    "received the frame later than the tracker did, --arrivals captured takes the "
+                    "time of its capture"
+                )
+            if begun is not None and begun > ready:
+                raise LaeError(f"{output.where}: started {seconds(begun - ready)} after it was ready")
+            if frame > 0 and last < 0:  # of the initialisation the log does not tell
+                boxes[0], elapsed_ns[0], last = init_box, 0, 0
+                ready_ns.append(0)
+                init_note = "the log does not tell of the initialisation, which takes no time here"
+            if frame < last:
+                overtaken += 1
+                continue
+            start = max(free, here)
+            if last >= 0 and start * clock.ticks_per_ns >= clock.end(length):
+                late += 1
+                continue
+            if frame == 0 and init_box is not None:
+                box = init_box
+            else:
+                lost += output.box is None
+                box = output.box or box
+            boxes[frame], elapsed_ns[frame] = box, ready - start
+            score[frame] = math.nan if output.score is None else output.score
+            if begun is not None:
+                if begun < free:
+                    overlapping += 1
+                else:
+                    queue[frame], call[frame] = begun - start, ready - begun
+            free, last = ready, frame
+            ready_ns.append(ready)
+        counted = {
+            "outputs of frames that are left out": early,
+            "outputs of frames older than one whose output was ready are left out": overtaken,
+            "outputs that began after the stream had ended are left out": late,
+            "calls began before the one before was ready: the trace has the time from one output to "
+            "the next": overlapping,
+        }
+        notes = [f"{count:,} {what}" for what, count in counted.items() if count]
+        stages = {"queue": queue, "tracker": call} if (call >= 0).any() else {}
+        return cls(boxes, elapsed_ns, score, stages, ready_ns, lost, init_note, notes)
+
+
+def _differs(recording: Recording, clock: Clock, timeline: _Timeline) -> bool:
+    """Whether a replay has other outputs, or at other times, than the log."""
+    schedule = replay_sequence(recording, clock, policy=AsRecorded()).schedule
+    frames = np.flatnonzero(recording.elapsed_ns >= 0).tolist()
+    ready = [at * schedule.clock.ticks_per_ns for at in timeline.ready_ns]
+    return schedule.frames.tolist() != frames or schedule.ready.tolist() != ready
