@@ -89,7 +89,7 @@ class Offset:
 
     Attributes:
         ns: the offset.
-        source: ``"given"``, ``"estimated"`` from the least delay, or ``"one clock"``.
+        source: ``"given"``, ``"estimated"`` from the least delay, or ``"assumed"``.
     """
 
     ns: int
@@ -128,7 +128,7 @@ def clock_offset(path: Path, delays_ns: Sequence[int], asked: str | None) -> Off
             "the camera's times with --clock-offset=TIME, or estimate it with --clock-offset "
             "estimate"
         )
-    return Offset(ns, "one clock" if asked is None else "given")
+    return Offset(ns, "assumed" if asked is None else "given")
 
 
 def seconds(ns: int) -> str:

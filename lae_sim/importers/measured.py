@@ -285,7 +285,7 @@ def _arrived(
             delays = [to - known[frame] for frame, to in ready.items()]
         found = clock_offset(path, delays, offset)
         known = [at + found.ns for at in known]
-        facts |= {"clock_offset_ns": found.ns, "clock_offset": found.source}
+        facts |= {"clock_offset_ns": found.ns, "clock_offset_source": found.source}
     elif delays:
         facts |= _camera_delay(path, delays, offset)
     for frame, before, at in zip(log.frames[1:], known, known[1:]):
@@ -300,12 +300,12 @@ def _arrived(
 def _clock_notes(facts: Mapping[str, Any]) -> list[str]:
     """What is to be said of the clocks, a sentence each."""
     notes = []
-    if facts.get("clock_offset") == "estimated":
+    if facts.get("clock_offset_source") == "estimated":
         notes.append(
             f"the camera's clock is {facts['clock_offset_ns'] / 1e9:+.9f} s from the log's by the least "
             "delay: an estimate, which takes the quickest frame to need no time"
         )
-    elif facts.get("clock_offset") == "unknown":
+    elif facts.get("clock_offset_source") == "unknown":
         notes.append("the camera's clock is another, so its delay is unknown (--clock-offset)")
     if facts["arrivals"] == "captured":
         notes.append("frames arrive when they were captured: ages hold the camera's delay")
@@ -325,11 +325,11 @@ def _camera_delay(path: Path, delays: Sequence[int], offset: str | None) -> dict
     except LaeError:
         if offset is not None:
             raise
-        return {"clock_offset": "unknown"}  # nothing but this delay rests on it
+        return {"clock_offset_source": "unknown"}  # nothing but this delay rests on it
     own = sorted(delay - found.ns for delay in delays)
     return {
         "clock_offset_ns": found.ns,
-        "clock_offset": found.source,
+        "clock_offset_source": found.source,
         "camera_delay_ns": {"least": own[0], "median": median_low(own), "most": own[-1]},
     }
 

@@ -29,7 +29,7 @@ from lae_sim.importers.logs import (
 from lae_sim.trace.metadata import ImageSizes
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
+    from rosbags import rosbag1, rosbag2
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -105,21 +105,20 @@ def read_bag(path: Path, options: BagOptions) -> Log:
             number of the message, from 1.
     """
     try:
-        from rosbags.highlevel import AnyReader
+        from rosbags import rosbag1, rosbag2
     except ImportError as error:
         raise LaeError(f"{path}: a ROS bag: to read it {install('ros')}") from error
     try:
-        with AnyReader([path], default_typestore=_typestore()) as reader:
+        with (rosbag1 if path.suffix == ".bag" else rosbag2).Reader(path) as reader:
             return _Bag(path, reader, options).log()
     except (LaeError, MemoryError):
         raise
     except Exception as error:  # a damaged bag can raise anything
-        text = one_line(str(error))[:200] or type(error).__name__
-        raise LaeError(f"{path}: not a readable bag: {text}") from error
+        raise LaeError(f"{path}: not a readable bag: {_reason(error)}") from error
 
 
-def _typestore() -> Any:
-    """The definitions that a bag without any is read by."""
+def ros_types() -> Any:
+    """The definitions that bags without any are read by: those of ROS 2, and of vision_msgs 4."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -128,6 +127,39 @@ def _typestore() -> Any:
         found |= get_types_from_msg(text, f"vision_msgs/msg/{name}")
     store.register(found)
     return store
+
+
+def _types_of(connection: Any) -> Any:
+    """The definitions that messages of a topic are read by: the bag's own, where it has any.
+
+    Those of other topics are left alone, since a bag may hold some that cannot be read.
+    """
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    text = connection.msgdef.data
+    if connection.msgdef.format == MessageDefinitionFormat.NONE:
+        return ros_types()
+    store = get_typestore(Stores.EMPTY)
+    if connection.msgdef.format == MessageDefinitionFormat.MSG:
+        store.register(get_types_from_msg(text, _type(connection.msgtype)))
+        return store
+    found: dict[str, Any] = {}
+    for part in re.split(r"^={80}\n(?:IDL: .*\n)?", text, flags=re.MULTILINE):
+        found |= get_types_from_idl(part) if part.strip() else {}
+    store.register(found)
+    return store
+
+
+def _type(name: str) -> str:
+    """The name of a type: ``sensor_msgs/msg/Image``, also where it is written without ``msg``."""
+    package, _, rest = name.partition("/")
+    return name if "/" in rest else f"{package}/msg/{rest}"
+
+
+def _reason(error: Exception) -> str:
+    """What a library's error says, in one line."""
+    return one_line(str(error))[:200] or type(error).__name__
 
 
 @dataclass(frozen=True)
@@ -153,10 +185,10 @@ class _Answer:
 class _Bag:
     """Reads the topics of a bag that is open."""
 
-    def __init__(self, path: Path, reader: AnyReader, options: BagOptions) -> None:
+    def __init__(self, path: Path, reader: rosbag1.Reader | rosbag2.Reader, options: BagOptions) -> None:
         self.path, self.reader, self.options = path, reader, options
         self.types = {
-            topic: str(each.msgtype) for topic, each in reader.topics.items() if each.msgcount
+            topic: _type(str(each.msgtype)) for topic, each in reader.topics.items() if each.msgcount
         }
         self.notes: list[str] = []
 
@@ -256,25 +288,30 @@ class _Bag:
     def _messages(self, topic: str, stamp: str = "header.stamp") -> Iterator[_Message]:
         """The messages of a topic, in the order in which they were received."""
         connections = [each for each in self.reader.connections if each.topic == topic]
+        kind = self.types[topic]
+        try:
+            types = _types_of(connections[0])
+        except Exception as error:
+            raise LaeError(
+                f"{self.path}: the definition of {kind}, of {topic}, cannot be read: {_reason(error)}"
+            ) from error
+        if kind not in types.fielddefs:
+            raise LaeError(f"{self.path}: the bag does not define {kind}, the type of {topic}")
+        decode = types.deserialize_ros1 if self.path.suffix == ".bag" else types.deserialize_cdr
         number = 0
         messages = self.reader.messages(connections)
         while True:
-            where = f"{self.path}, message {number + 1} of {topic}"
+            number += 1
+            where = f"{self.path}, message {number} of {topic}"
             try:
-                connection, received_ns, data = next(messages)
-                content = self.reader.deserialize(data, connection.msgtype)
+                _, received_ns, data = next(messages)
+                content = decode(data, kind)
             except StopIteration:
                 return
             except MemoryError:
                 raise
-            except KeyError as error:
-                raise LaeError(
-                    f"{self.path}: the bag does not define the type of {topic}, {error}"
-                ) from error
             except Exception as error:  # what is damaged can raise anything
-                text = one_line(str(error))[:200] or type(error).__name__
-                raise LaeError(f"{where}: damaged: {text}") from error
-            number += 1
+                raise LaeError(f"{where}: damaged: {_reason(error)}") from error
             at = _nanoseconds(_value(content, stamp, where), f"{where}: {stamp}")
             yield _Message(number, where, int(received_ns), at, content)
 
@@ -351,7 +388,7 @@ class _Bag:
             offset = clock_offset(self.path, delays, options.clock_offset)
             offset_ns = offset.ns
             how = {"matched_by": f"nearest earlier frame, within {options.match}"}
-            how |= {"clock_offset_ns": offset.ns, "clock_offset": offset.source}
+            how |= {"clock_offset_ns": offset.ns, "clock_offset_source": offset.source}
             shifted = [stamp + offset.ns for stamp in stamps]
             at = [answer.message.stamp_ns for answer in answers]
             places = [nearest_earlier(shifted, each, tolerance) for each in at]
