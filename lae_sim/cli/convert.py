@@ -26,10 +26,18 @@ if TYPE_CHECKING:
     from lae_sim.trace.file import Trace
 
 _FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "json", "npz", "lae-pvt", "ros", "csv")
-_RESULTS_ONLY = ("time_unit", "repetition", "time", "sequence", "exclude", "truth_file", "frame_times")
+_RESULTS_ONLY = (
+    "time_unit",
+    "repetition",
+    "time",
+    "sequence",
+    "exclude",
+    "truth_file",
+    "frame_times",
+)
 _LOGS_ONLY = (
-    "image_topic", "box_topic", "truth_topic", "field", "target", "match", "clock_offset", "arrivals",
-    "gaps", "init_box",
+    "image_topic", "box_topic", "truth_topic", "field", "target", "match", "clock_offset",
+    "arrivals", "gaps", "init_box",
 )  # fmt: skip
 _EXAMPLES = f"""\
 formats (auto tells them apart):
@@ -66,8 +74,8 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = new_parser(
         "lae-sim convert",
-        "Make a trace from a tracker's results and the dataset's ground truth, or from the log of a "
-        "tracker that ran: a ROS bag, or a table.",
+        "Make a trace from a tracker's results and the dataset's ground truth, or from the log of "
+        "a tracker that ran: a ROS bag, or a table.",
         _EXAMPLES,
     )
     add = made.add_argument

@@ -21,7 +21,8 @@ COLUMNS = ("frame", *TIMES, *BOX, "score", *TRUTH)
 
 _UNITS = {"\u00b5s": "us", "\u03bcs": "us", "sec": "s", "msec": "ms", "usec": "us", "nsec": "ns"}
 _HEADER = re.compile(
-    r"(?P<name>[a-z_]+?)(?:[ _]*[\[(]\s*(?P<bracket>[^\])]*?)\s*[\])]|[ _](?P<tail>[a-z\u00b5\u03bc]+))?\Z"
+    r"(?P<name>[a-z_]+?)"
+    r"(?:[ _]*[\[(]\s*(?P<bracket>[^\])]*?)\s*[\])]|[ _](?P<tail>[a-z\u00b5\u03bc]+))?\Z"
 )
 _CELL_BYTES = 64
 _NONE = ("", "nan", "null", "none", "-")
@@ -34,9 +35,9 @@ def read_table(path: Path, gaps: str | None = None) -> Log:
 
     The header names the columns, and the unit of each time: ``ready_ms``, ``ready [us]``,
     ``captured_s``. There are ``frame``, ``ready``, ``x``, ``y``, ``w``, ``h``, and ``arrived`` or
-    ``captured``, at least; ``started``, ``score`` and ``truth_x`` ... ``truth_h`` may be there. Times
-    are decimals of any length, read exactly and rounded to ns, half to even. A row without
-    ``ready`` is a frame that was not processed; one without a box, where the tracker found none.
+    ``captured``, at least; ``started``, ``score`` and ``truth_x`` ... ``truth_h`` may be there.
+    Times are decimals, read exactly and rounded to ns, half to even. A row without ``ready`` is a
+    frame that was not processed; one without a box, where the tracker found none.
 
     Args:
         path: a file of commas, semicolons or tabs.

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from lae_sim.engine.clock import parse_duration
+from lae_sim.engine.clock import NS_PER_SECOND, parse_duration
 from lae_sim.errors import LaeError
 from lae_sim.trace.metadata import ImageSizes
 
@@ -118,22 +118,35 @@ def clock_offset(path: Path, delays_ns: Sequence[int], asked: str | None) -> Off
         try:
             ns = parse_duration(asked.removeprefix("-"))
         except LaeError as error:
-            raise LaeError(f"--clock-offset: a time, such as -12ms, or estimate: {error}") from error
+            raise LaeError(
+                f"--clock-offset: a time, such as -12ms, or estimate: {error}"
+            ) from error
         ns = -ns if asked.startswith("-") else ns
     if not 0 <= least - ns <= _MOST_DELAY_NS:
         how = "after" if least >= ns else "before"
         raise LaeError(
-            f"{path}: with {'one clock' if asked is None else f'the offset {asked}'} the quickest "
-            f"frame arrives {seconds(abs(least - ns))} {how} it was captured; say what to add to "
-            "the camera's times with --clock-offset=TIME, or estimate it with --clock-offset "
-            "estimate"
+            f"{path}: with {'the same clock' if asked is None else f'the offset {asked}'} the "
+            f"quickest frame arrives {seconds(abs(least - ns))} {how} it was captured; say what to "
+            "add to the camera's times with --clock-offset=TIME, or estimate it with "
+            "--clock-offset estimate"
         )
     return Offset(ns, "assumed" if asked is None else "given")
+
+
+def of_one_clock(delays_ns: Sequence[int]) -> bool:
+    """Whether delays, from a stamp to when it was received, may be those of one clock."""
+    return 0 <= min(delays_ns) <= _MOST_DELAY_NS
 
 
 def seconds(ns: int) -> str:
     """A time in words."""
     return f"{ns / 1e6:,.3g} ms" if ns < 10**9 else f"{ns / 1e9:,.4g} s"
+
+
+def in_seconds(ns: int) -> str:
+    """A time in seconds, exactly."""
+    whole, rest = divmod(abs(ns), NS_PER_SECOND)
+    return f"{'-' if ns < 0 else ''}{whole}.{rest:09}"
 
 
 def nearest_earlier(times_ns: Sequence[int], at_ns: int, tolerance_ns: int) -> int | None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from dataclasses import fields as fields_of
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +14,7 @@ from statistics import median_low
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lae_sim._arrays import Floats, Ints
 from lae_sim.datasets.annotations import read_truth
@@ -21,7 +23,7 @@ from lae_sim.engine.clock import NS_PER_SECOND, Clock, Number, parse_fps
 from lae_sim.errors import LaeError, shown
 from lae_sim.importers.convert import ConversionSummary
 from lae_sim.importers.log_table import read_table
-from lae_sim.importers.logs import Box, Log, LoggedOutput, clock_offset, seconds
+from lae_sim.importers.logs import Box, Log, LoggedOutput, clock_offset, in_seconds, seconds
 from lae_sim.importers.rosbag import SUFFIXES, BagOptions, read_bag
 from lae_sim.replay.recorded import RECORDED_POLICY, AsRecorded
 from lae_sim.replay.run import replay_sequence
@@ -138,70 +140,34 @@ def convert_log(
     for name, value, known in (("arrivals", arrivals, ARRIVALS), ("gaps", gaps, GAPS)):
         if value is not None and value not in known:
             raise LaeError(f"{name}: no {shown(value)}: there are {' and '.join(known)}")
-    of_bags = {
-        "image_topic": image_topic,
-        "box_topic": box_topic,
-        "truth_topic": truth_topic,
-        "field": fields,
-        "target": target,
-        "match": match,
-    }
-    if kind == "ros":
-        if gaps is not None:
-            raise LaeError("gaps is of tables, whose frames have numbers")
-        found = read_bag(
-            path,
-            BagOptions(
-                image_topic, box_topic, truth_topic, fields, target, match, clock_offset,
-                skip_missing,
-            ),
-        )
-    else:
-        if given := [name for name, value in of_bags.items() if value]:
-            raise LaeError(f"{path}: {', '.join(given)}: of bags, and this is a table")
-        found = read_table(path, gaps)
-    return _converted(
-        path, kind, found, truth, fps, init_box, arrivals, clock_offset, tracker, device, dataset,
-        image_size,
+    given = BagOptions(
+        image_topic, box_topic, truth_topic, fields, target, match, clock_offset, skip_missing
     )
-
-
-def _converted(
-    path: Path,
-    kind: str,
-    log: Log,
-    truth: str | Path | None,
-    fps: Number | None,
-    init_box: Box | None,
-    arrivals: str | None,
-    offset: str | None,
-    tracker: str | None,
-    device: str | None,
-    dataset: str | None,
-    image_size: tuple[int, int] | None,
-) -> tuple[Trace, ConversionSummary]:
-    """The trace of a log that has been read."""
-    notes = list(log.notes)
-    facts = dict(log.facts)
-    if not log.frames or not log.outputs:
-        raise LaeError(f"{path}: no {'outputs' if log.frames else 'frames'}")
-    arrived, how = _arrived(path, log, arrivals, offset)
+    found = _read(path, kind, given, gaps)
+    facts, notes = {**found.facts}, [*found.notes]
+    arrived, how, said = _arrived(path, found, arrivals, clock_offset)
     facts |= how
-    notes += _clock_notes(facts)
-    known_truth = _truth(log, truth)
-    tracker, name = tracker or log.tracker, path.stem
-    rate = str(fps) if fps is not None else _estimated_rate(path, log, arrived)
+    notes += said
+    known_truth = _truth(found, truth)
+    tracker, name = tracker or found.tracker, path.stem
+    rate = str(fps) if fps is not None else _estimated_rate(path, found, arrived)
     if fps is None:
         notes.append(f"{rate} frames/s is estimated, from the median time between frames; --fps")
-    begin = 0 if init_box else _first(path, log.outputs)
+    begin = 0 if init_box else _first(path, found.outputs)
     if begin:
         notes.append(f"{begin:,} frames before the first output are left out")
     clock = Clock.at(parse_fps(rate))
     own = with_arrivals(clock, [at - arrived[begin] for at in arrived[begin:]])
-    timeline = _Timeline.of(log.outputs, arrived, begin, own, init_box)
+    timeline = _Timeline.of(found.outputs, arrived, begin, own, init_box)
     recording = Recording.new(
-        name, known_truth[begin:], timeline.boxes, timeline.elapsed_ns, timeline.score,
-        np.array(arrived[begin:]) - arrived[begin], None, timeline.stages,
+        name,
+        known_truth[begin:],
+        timeline.boxes,
+        timeline.elapsed_ns,
+        timeline.score,
+        np.array(arrived[begin:]) - arrived[begin],
+        None,
+        timeline.stages,
     )
     RowChecker(str(path), profiled=True)(Rows.of_recordings([recording]))
     if _differs(recording, clock, timeline):
@@ -216,9 +182,11 @@ def _converted(
         "includes": "from when a frame had arrived and the output before was ready to its output",
         "note": timeline.init_note,
     }
-    if log.interpolated:
-        timing["note"] += f"; {log.interpolated:,} frames that the log left out arrive at even steps"
-    sizes = log.image_sizes
+    if found.interpolated:
+        timing["note"] += (
+            f"; {found.interpolated:,} frames that the log left out arrive at even steps"
+        )
+    sizes = found.image_sizes
     if image_size is not None:
         entry: dict[str, Any] = {"image_size": list(image_size)}
     else:
@@ -237,7 +205,9 @@ def _converted(
         sequences={name: entry},
     )
     processed = recording.elapsed_ns[recording.elapsed_ns >= 0]
-    files = [*sorted(each for each in path.iterdir() if each.is_file())] if path.is_dir() else [path]
+    files = (
+        [*sorted(each for each in path.iterdir() if each.is_file())] if path.is_dir() else [path]
+    )
     summary = ConversionSummary(
         format=kind,
         schedule="real-time",
@@ -263,75 +233,87 @@ def _converted(
     return Trace(metadata, [recording]), summary
 
 
+def _read(path: Path, kind: str, options: BagOptions, gaps: str | None) -> Log:
+    """A log of either format; what is said of the other one is refused."""
+    if kind == "ros":
+        if gaps is not None:
+            raise LaeError("gaps: of tables, whose frames have numbers, and this is a bag")
+        log = read_bag(path, options)
+    else:
+        names = {each.name for each in fields_of(options)} - {"clock_offset"}
+        if others := sorted(name for name in names if getattr(options, name)):
+            raise LaeError(f"{', '.join(others)}: of bags, and {path} is a table")
+        log = read_table(path, gaps)
+    if not log.frames or not log.outputs:
+        raise LaeError(f"{path}: no {'outputs' if log.frames else 'frames'}")
+    return log
+
+
 def _arrived(
     path: Path, log: Log, asked: str | None, offset: str | None
-) -> tuple[list[int], dict[str, Any]]:
-    """When each frame arrived, on the log's clock, and how one knows."""
+) -> tuple[list[int], dict[str, Any], list[str]]:
+    """When each frame arrived, on the log's clock; how one knows, as facts and as sentences."""
     captured = [frame.captured_ns for frame in log.frames]
     received = [frame.arrived_ns for frame in log.frames]
     if asked is None:
         asked = "captured" if all(at is None for at in received) else "received"
-    times, facts = received, {"arrivals": asked}
-    if asked == "captured":
-        times = captured
-    for frame, at in zip(log.frames, times):
+    known: list[int] = []
+    for frame, at in zip(log.frames, captured if asked == "captured" else received):
         if at is None:
             raise LaeError(f"{frame.where}: no time when the frame was {asked}")
-    known = [at for at in times if at is not None]
+        known.append(at)
     delays = [to - at for to, at in zip(received, captured) if to is not None and at is not None]
+    to = "arrival"
+    if asked == "captured" and not delays:  # a frame arrives before its output is ready
+        delays, to = [each.ready_ns - known[each.frame] for each in log.outputs], "output"
+    facts, notes = _clocks(path, delays, to, offset, needed=asked == "captured")
     if asked == "captured":
-        if not delays:  # a frame arrives before its output
-            ready = {output.frame: output.started_ns or output.ready_ns for output in log.outputs}
-            delays = [to - known[frame] for frame, to in ready.items()]
-        found = clock_offset(path, delays, offset)
-        known = [at + found.ns for at in known]
-        facts |= {"clock_offset_ns": found.ns, "clock_offset_source": found.source}
-    elif delays:
-        facts |= _camera_delay(path, delays, offset)
-    for frame, before, at in zip(log.frames[1:], known, known[1:]):
-        if at <= before:
-            when = "together with" if at == before else f"{seconds(before - at)} before"
-            raise LaeError(
-                f"{frame.where}: {asked} {when} the frame ahead of it: frames come one after another"
-            )
-    return known, facts
-
-
-def _clock_notes(facts: Mapping[str, Any]) -> list[str]:
-    """What is to be said of the clocks, a sentence each."""
-    notes = []
-    if facts.get("clock_offset_source") == "estimated":
-        notes.append(
-            f"the camera's clock is {facts['clock_offset_ns'] / 1e9:+.9f} s from the log's by the least "
-            "delay: an estimate, which takes the quickest frame to need no time"
-        )
-    elif facts.get("clock_offset_source") == "unknown":
-        notes.append("the camera's clock is another, so its delay is unknown (--clock-offset)")
-    if facts["arrivals"] == "captured":
+        known = [at + facts["clock_offset_ns"] for at in known]
         notes.append("frames arrive when they were captured: ages hold the camera's delay")
-    elif "camera_delay_ns" in facts:
-        delay = facts["camera_delay_ns"]["median"]
-        notes.append(
-            f"frames arrive when the log received them, {seconds(delay)} after capture (median); ages "
-            "count from then"
-        )
-    return notes
+    elif delays:
+        notes.append("frames arrive when the log received them: ages hold no delay of the camera")
+    times, together = known[:1], 0
+    for frame, before, at in zip(log.frames[1:], known, known[1:]):
+        if at < before:
+            raise LaeError(
+                f"{frame.where}: {asked} {seconds(before - at)} before the frame ahead of it: "
+                "frames come one after another"
+            )
+        together += at <= times[-1]
+        times.append(max(at, times[-1] + 1))
+    if together:
+        notes.append(f"{together:,} frames {asked} at the instant of another arrive 1 ns after it")
+    return times, {"arrivals": asked, **facts}, notes
 
 
-def _camera_delay(path: Path, delays: Sequence[int], offset: str | None) -> dict[str, Any]:
-    """How long frames took from capture to arrival, as far as the clocks tell."""
+def _clocks(
+    path: Path, delays: Sequence[int], to: str, offset: str | None, needed: bool
+) -> tuple[dict[str, Any], list[str]]:
+    """What is known of the camera's clock, by how long frames took from capture to another time."""
+    if not delays:
+        return {}, []
     try:
         found = clock_offset(path, delays, offset)
     except LaeError:
-        if offset is not None:
+        if needed or offset is not None:
             raise
-        return {"clock_offset_source": "unknown"}  # nothing but this delay rests on it
+        unknown = "the camera's clock is another than the log's, so its delay is unknown"
+        return {"clock_offset_source": "unknown"}, [f"{unknown} (--clock-offset)"]
     own = sorted(delay - found.ns for delay in delays)
-    return {
-        "clock_offset_ns": found.ns,
-        "clock_offset_source": found.source,
-        "camera_delay_ns": {"least": own[0], "median": median_low(own), "most": own[-1]},
-    }
+    facts: dict[str, Any] = {"clock_offset_ns": found.ns, "clock_offset_source": found.source}
+    notes = []
+    if found.source == "estimated":
+        notes.append(
+            f"{in_seconds(found.ns)} s are added to capture times, to have the log's clock: an "
+            f"estimate, by which the quickest frame takes no time from capture to {to}"
+        )
+    if to == "arrival":
+        facts["camera_delay_ns"] = {"least": own[0], "median": median_low(own), "most": own[-1]}
+        notes.append(
+            f"from capture to arrival frames take {seconds(median_low(own))} (median), at most "
+            f"{seconds(own[-1])}"
+        )
+    return facts, notes
 
 
 def _truth(log: Log, path: str | Path | None) -> Floats:
@@ -356,7 +338,9 @@ def _estimated_rate(path: Path, log: Log, arrived: Sequence[int]) -> str:
     if len(times) < len(arrived):
         times = list(arrived)
     intervals = [to - at for at, to in pairwise(times)]
-    hundredths = round(Fraction(100 * NS_PER_SECOND, max(median_low(intervals), 1))) if intervals else 0
+    hundredths = (
+        round(Fraction(100 * NS_PER_SECOND, max(median_low(intervals), 1))) if intervals else 0
+    )
     if not hundredths:
         raise LaeError(f"{path}: too few frames to tell their rate: give it by --fps")
     return f"{hundredths // 100}.{hundredths % 100:02}".rstrip("0").rstrip(".")
@@ -390,7 +374,7 @@ class _Timeline:
 
     boxes: Floats
     elapsed_ns: Ints
-    score: Floats
+    score: npt.NDArray[np.float32]
     stages: dict[str, Ints]
     ready_ns: list[int]
     lost: int
@@ -445,7 +429,9 @@ class _Timeline:
                     "time of its capture"
                 )
             if begun is not None and begun > ready:
-                raise LaeError(f"{output.where}: started {seconds(begun - ready)} after it was ready")
+                raise LaeError(
+                    f"{output.where}: started {seconds(begun - ready)} after it was ready"
+                )
             if frame > 0 and last < 0:  # of the initialisation the log does not tell
                 boxes[0], elapsed_ns[0], last = init_box, 0, 0
                 ready_ns.append(0)
@@ -475,8 +461,8 @@ class _Timeline:
             "outputs of frames that are left out": early,
             "outputs of frames older than one whose output was ready are left out": overtaken,
             "outputs that began after the stream had ended are left out": late,
-            "calls began before the one before was ready: the trace has the time from one output to "
-            "the next": overlapping,
+            "calls began before the one before was ready: their times reach from output to "
+            "output": overlapping,
         }
         notes = [f"{count:,} {what}" for what, count in counted.items() if count]
         stages = {"queue": queue, "tracker": call} if (call >= 0).any() else {}
@@ -488,4 +474,4 @@ def _differs(recording: Recording, clock: Clock, timeline: _Timeline) -> bool:
     schedule = replay_sequence(recording, clock, policy=AsRecorded()).schedule
     frames = np.flatnonzero(recording.elapsed_ns >= 0).tolist()
     ready = [at * schedule.clock.ticks_per_ns for at in timeline.ready_ns]
-    return schedule.frames.tolist() != frames or schedule.ready.tolist() != ready
+    return bool(schedule.frames.tolist() != frames or schedule.ready.tolist() != ready)

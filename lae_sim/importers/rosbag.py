@@ -23,7 +23,9 @@ from lae_sim.importers.logs import (
     LoggedFrame,
     LoggedOutput,
     clock_offset,
+    in_seconds,
     nearest_earlier,
+    of_one_clock,
     seconds,
 )
 from lae_sim.trace.metadata import ImageSizes
@@ -185,10 +187,14 @@ class _Answer:
 class _Bag:
     """Reads the topics of a bag that is open."""
 
-    def __init__(self, path: Path, reader: rosbag1.Reader | rosbag2.Reader, options: BagOptions) -> None:
+    def __init__(
+        self, path: Path, reader: rosbag1.Reader | rosbag2.Reader, options: BagOptions
+    ) -> None:
         self.path, self.reader, self.options = path, reader, options
         self.types = {
-            topic: _type(str(each.msgtype)) for topic, each in reader.topics.items() if each.msgcount
+            topic: _type(str(each.msgtype))
+            for topic, each in reader.topics.items()
+            if each.msgcount
         }
         self.notes: list[str] = []
 
@@ -293,7 +299,8 @@ class _Bag:
             types = _types_of(connections[0])
         except Exception as error:
             raise LaeError(
-                f"{self.path}: the definition of {kind}, of {topic}, cannot be read: {_reason(error)}"
+                f"{self.path}: the definition of {kind}, the type of {topic}, cannot be read: "
+                f"{_reason(error)}"
             ) from error
         if kind not in types.fielddefs:
             raise LaeError(f"{self.path}: the bag does not define {kind}, the type of {topic}")
@@ -323,8 +330,8 @@ class _Bag:
             if message.stamp_ns <= last:
                 zero = "; is the header filled?" if not message.stamp_ns else ""
                 raise LaeError(
-                    f"{message.where}: its stamp is {_clock(message.stamp_ns)}, not after that of "
-                    f"the message before, {_clock(last)}{zero}"
+                    f"{message.where}: its stamp is {in_seconds(message.stamp_ns)}, not after that "
+                    f"of the message before, {in_seconds(last)}{zero}"
                 )
             last = message.stamp_ns
             frames.append(LoggedFrame(message.where, message.stamp_ns, message.received_ns))
@@ -365,8 +372,8 @@ class _Bag:
         if several:
             ids = sorted(names - {""})
             self.notes.append(
-                f"{several:,} messages of {topic} hold several targets; of each the one of the best "
-                f"score is taken (--target ID chooses one{': ' if ids else ''}{listed(ids)})"
+                f"{several:,} messages of {topic} hold several targets; of each the one of the "
+                f"best score is taken (--target ID chooses one{': ' if ids else ''}{listed(ids)})"
             )
 
     def _matched(
@@ -384,12 +391,9 @@ class _Bag:
             places = [place_of.get(answer.message.stamp_ns) for answer in answers]
         else:
             tolerance = parse_duration(options.match)
-            delays = [(f.arrived_ns or 0) - (f.captured_ns or 0) for f in frames]
-            offset = clock_offset(self.path, delays, options.clock_offset)
-            offset_ns = offset.ns
-            how = {"matched_by": f"nearest earlier frame, within {options.match}"}
-            how |= {"clock_offset_ns": offset.ns, "clock_offset_source": offset.source}
-            shifted = [stamp + offset.ns for stamp in stamps]
+            how = {"matched_by": f"nearest earlier stamp, within {options.match}"}
+            offset_ns = self._between_clocks(frames, answers)
+            shifted = [stamp + offset_ns for stamp in stamps]
             at = [answer.message.stamp_ns for answer in answers]
             places = [nearest_earlier(shifted, each, tolerance) for each in at]
         early = [
@@ -402,15 +406,15 @@ class _Bag:
             near = bisect_left(stamps, first.stamp_ns - offset_ns) - 1
             away = first.stamp_ns - offset_ns - stamps[max(near, 0)]
             raise LaeError(
-                f"{self.path}: {len(lost) or len(answers):,} of {len(answers):,} messages of {topic} "
-                f"belong to no frame: the stamp of number {first.number} is "
+                f"{self.path}: {len(lost) or len(answers):,} of {len(answers):,} messages of "
+                f"{topic} belong to no frame: the stamp of number {first.number} is "
                 f"{seconds(abs(away))} {'after' if away >= 0 else 'before'} that of the nearest one"
                 "; --match 20ms takes the nearest earlier frame within that, --clock-offset=TIME "
                 "sets another clock right, --skip-missing leaves such boxes out"
             )
         if any(early):
             self.notes.append(
-                f"{sum(early):,} messages of {topic} are of frames before the first one and left out"
+                f"{sum(early):,} messages of {topic} are of frames before the first, and left out"
             )
         if lost:
             self.notes.append(
@@ -418,9 +422,20 @@ class _Bag:
             )
         return places, how
 
-    def _time(
-        self, message: _Message, fields: Mapping[str, str], name: str, otherwise: Any
-    ) -> Any:
+    def _between_clocks(self, frames: Sequence[LoggedFrame], answers: Sequence[_Answer]) -> int:
+        """What to add to the frames' stamps to have the boxes' clock, ns.
+
+        Stamps are of one clock, such as that of a simulation, unless those of the boxes alone are
+        of the log's.
+        """
+        of_frames = [(frame.arrived_ns or 0) - (frame.captured_ns or 0) for frame in frames]
+        of_boxes = [each.message.received_ns - each.message.stamp_ns for each in answers]
+        asked = self.options.clock_offset
+        if not of_one_clock(of_boxes) or (asked is None and of_one_clock(of_frames)):
+            return 0
+        return clock_offset(self.path, of_frames, asked).ns
+
+    def _time(self, message: _Message, fields: Mapping[str, str], name: str, otherwise: Any) -> Any:
         if name not in fields:
             return otherwise
         where = f"{message.where}: {fields[name]}"
@@ -437,7 +452,9 @@ def _checked_fields(fields: Mapping[str, str]) -> Mapping[str, str]:
         if name not in FIELDS:
             raise LaeError(f"--field: no {shown(name)}: there are {', '.join(FIELDS)}")
         if "".join(match[0] for match in _STEP.finditer(path)) != path or not path:
-            raise LaeError(f"--field {name}: {shown(path)} is no path such as bbox.center.x or a[0]")
+            raise LaeError(
+                f"--field {name}: {shown(path)} is no path such as bbox.center.x or a[0]"
+            )
     sides = {*fields} & {side for sides in SIDES for side in sides}
     if fields and not any(sides == {*each} for each in SIDES):
         raise LaeError(
@@ -456,7 +473,8 @@ def _value(content: Any, path: str, where: str) -> Any:
             known = getattr(value, "__dataclass_fields__", {})
             if name not in known:
                 raise LaeError(
-                    f"{where}: no field {path!r}: {name!r} is not among {listed(known, 12) or 'any'}"
+                    f"{where}: no field {path!r}: {name!r} is not among "
+                    f"{listed(known, 12) or 'any'}"
                 )
             value = getattr(value, name)
         else:
@@ -549,8 +567,3 @@ def _best(message: _Message, targets: Sequence[Any]) -> _Answer:
         _sized(float(centre.x) - w / 2, float(centre.y) - h / 2, w, h),
         None if math.isnan(score) else score,
     )
-
-
-def _clock(ns: int) -> str:
-    """A stamp as ROS prints it."""
-    return f"{ns // NS_PER_SECOND}.{ns % NS_PER_SECOND:09}"

@@ -497,7 +497,9 @@ class Runs:
         notes = []
         schedule = self.times.metadata.document["schedule"]
         if schedule.get("policy") == RECORDED_POLICY and not isinstance(self.policy, AsRecorded):
-            notes.append("the times are those of a log, whose own schedule policy 'recorded' repeats")
+            notes.append(
+                "the times are those of a log, whose own schedule policy 'recorded' repeats"
+            )
         if self.arrivals is None:
             return notes
         if self.forget_arrivals:
@@ -656,8 +658,7 @@ def _replayed(
     """The runs of some jobs, which have a service and a repetition each."""
     clocks, lengths = [job.clock for job in jobs], [len(job) for job in jobs]
     if isinstance(policy, AsRecorded):
-        each = zip(lengths, clocks, services, jobs)
-        schedules = (Schedules.of([simulate(n, c, s, _rule(policy, job))]) for n, c, s, job in each)
+        schedules = _as_recorded(jobs, services, policy)
     else:
         schedules = simulate_many(lengths, clocks, services, policy)
     begin = 0
@@ -667,6 +668,14 @@ def _replayed(
         those = slice(begin, begin + len(some))
         yield _run(jobs[those], some, repetition[those])
         begin += len(some)
+
+
+def _as_recorded(
+    jobs: Sequence[_Job], services: Sequence[Service], policy: AsRecorded
+) -> Iterator[Schedules]:
+    """The schedules of sequences that have rules of their own, one by one."""
+    for job, service in zip(jobs, services):
+        yield Schedules.of([simulate(len(job), job.clock, service, policy.of(job.times))])
 
 
 def _rule(policy: Policy, job: _Job) -> Policy:
