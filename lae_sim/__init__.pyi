@@ -13,7 +13,6 @@ from .figures.film import Scene
 from .forecast.base import Forecaster, Hold
 from .forecast.kalman import Kalman
 from .importers.convert import convert_results
-from .importers.measured import convert_log
 from .learning.registry import load_forecaster
 from .profile.run import profile_tracker
 from .recipes.catalogue import list_recipes
@@ -50,7 +49,6 @@ __all__ = [
     "TraceError",
     "World",
     "compare_forecasters",
-    "convert_log",
     "convert_results",
     "evaluate",
     "evaluate_runs",

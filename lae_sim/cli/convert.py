@@ -49,7 +49,7 @@ formats (auto tells them apart):
   json         <seq>.json with res and fps (jwlim's tracker_benchmark)
   npz          one file, an array [frames, 4] per sequence: needs --time
   lae-pvt      <seq>.pkl of LAE-PVT and PVT++, recorded in real time
-  ros          a ROS 2 bag (folder, .mcap, .db3), or one of ROS 1: a log ({install("ros")})
+  ros          a log: a ROS 2 bag (folder, .mcap, .db3), or one of ROS 1 ({install("ros")})
   csv          a log with a row a frame: frame, arrived_ms, ready_ms, x, y, w, h; perhaps
                captured_ms, started_ms, score, truth_x, ...; times in _s, _ms, _us or _ns
 Names may be <dataset>_<seq> (nfs_, uav_, ...), <seq>_<tracker> and <tracker>_<seq> in any format;
@@ -74,7 +74,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = new_parser(
         "lae-sim convert",
-        "Make a trace from a tracker's results and the dataset's ground truth, or from the log of "
+        "Make a trace from a tracker's results and the dataset's ground truth, or from the log of\n"
         "a tracker that ran: a ROS bag, or a table.",
         _EXAMPLES,
     )
@@ -92,7 +92,13 @@ def parser() -> argparse.ArgumentParser:
         help="the dataset's folder; of a log, if there is one, a file with a row for each frame",
     )
     add("--out", type=Path, required=True, metavar="TRACE", help="the trace to write (.parquet)")
-    add("--format", choices=_FORMATS, default="auto", help="format of RESULTS (default: auto)")
+    add(
+        "--format",
+        choices=_FORMATS,
+        default="auto",
+        metavar="FORMAT",
+        help="format of RESULTS, of those below (default: auto)",
+    )
     add(
         "--fps",
         help="world frames per second, such as 29.97 or 30000/1001 (default: 30, or 10 if the "

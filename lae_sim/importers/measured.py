@@ -48,10 +48,19 @@ def log_format(path: Path, wanted: str = "auto") -> str | None:
     if wanted != "auto":
         return wanted if wanted in LOG_FORMATS else None
     if path.is_dir():
-        bags = (path.glob(f"*{suffix}") for suffix in SUFFIXES)
-        return "ros" if (path / "metadata.yaml").exists() or any(map(any, bags)) else None
+        bags = (path.glob(f"*{suffix}*") for suffix in (".db3", ".mcap"))
+        return "ros" if any(map(any, bags)) or _of_bag(path / "metadata.yaml") else None
     suffix = path.suffix.lower()
     return "ros" if suffix in SUFFIXES else "csv" if suffix == ".csv" else None
+
+
+def _of_bag(path: Path) -> bool:
+    """Whether a file is the metadata of a bag."""
+    try:
+        with path.open("rb") as file:
+            return file.read(64).startswith(b"rosbag2_bagfile_information")
+    except OSError:
+        return False
 
 
 def convert_log(
@@ -114,13 +123,14 @@ def convert_log(
     Example:
         >>> import lae_sim, tempfile
         >>> from pathlib import Path
+        >>> from lae_sim.importers import convert_log
         >>> text = '''frame,arrived_ms,ready_ms,x,y,w,h
         ... 0,0,40,10,20,30,40
         ... 1,33,,,,,
         ... 2,67,95.5,12,20,30,40'''
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = (Path(folder) / "flight.csv").write_text(text)
-        ...     trace, summary = lae_sim.convert_log(f"{folder}/flight.csv", fps=30)
+        ...     trace, summary = convert_log(f"{folder}/flight.csv", fps=30)
         >>> trace["flight"].elapsed_ns.tolist(), trace["flight"].arrival_ns.tolist()
         ([40000000, -1, 28500000], [0, 33000000, 67000000])
         >>> run = lae_sim.replay_sequence(
