@@ -49,7 +49,7 @@ formats (auto tells them apart):
   json         <seq>.json with res and fps (jwlim's tracker_benchmark)
   npz          one file, an array [frames, 4] per sequence: needs --time
   lae-pvt      <seq>.pkl of LAE-PVT and PVT++, recorded in real time
-  ros          a log: a ROS 2 bag (folder, .mcap, .db3), or one of ROS 1 ({install("ros")})
+  ros          a log: a bag of ROS 2 (folder, .mcap, .db3) or ROS 1 ({install("ros")})
   csv          a log with a row a frame: frame, arrived_ms, ready_ms, x, y, w, h; perhaps
                captured_ms, started_ms, score, truth_x, ...; times in _s, _ms, _us or _ns
 Names may be <dataset>_<seq> (nfs_, uav_, ...), <seq>_<tracker> and <tracker>_<seq> in any format;

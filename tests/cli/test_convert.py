@@ -484,7 +484,8 @@ def test_a_log_replays_by_the_policy_that_is_named_last(tmp_path, capsys):
     )
     assert replay_main([str(trace), "--policy", "recorded", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["policy"] == "recorded"
+    assert found["traces"][0]["policy"] == "recorded"
+    assert found["traces"][0]["exact"]
     assert replay_main([str(trace)]) == 2
     assert "or the policy that it was recorded under" in capsys.readouterr().err
     assert main([str(tmp_path / "flight.csv"), "--json", "--out", str(trace)]) == 0
