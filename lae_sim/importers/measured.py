@@ -162,7 +162,7 @@ def convert_log(
     tracker, name = tracker or found.tracker, path.stem
     rate = str(fps) if fps is not None else _estimated_rate(path, found, arrived)
     if fps is None:
-        notes.append(f"{rate} frames/s is estimated, from the median time between frames; --fps")
+        notes.append(f"{rate} frames/s is estimated, from the median time between frames (--fps)")
     begin = 0 if init_box else _first(path, found.outputs)
     if begin:
         notes.append(f"{begin:,} frames before the first output are left out")

@@ -189,7 +189,7 @@ def test_the_rate_is_estimated_in_the_open(tmp_path: Path) -> None:
     path = written(tmp_path, rows_of(arrived, {0: (None, 40 * MS)}))
     trace, summary = convert_log(path)
     assert trace.metadata.document["fps"] == summary.fps == "29.97"
-    estimated = "29.97 frames/s is estimated, from the median time between frames; --fps"
+    estimated = "29.97 frames/s is estimated, from the median time between frames (--fps)"
     assert any(note.startswith(estimated) for note in summary.notes)
     with pytest.raises(LaeError, match="too few frames to tell their rate: give it by --fps"):
         convert_log(written(tmp_path, rows_of([0], {0: (None, 40 * MS)})))
