@@ -26,11 +26,11 @@ from targets import Line
 
 from lae_sim import Metadata, Recording, Trace, replay_trace, simulate, write_trace
 from lae_sim._compiled import SWITCH
+from lae_sim.comparison.pairs import Member, pairs_of
 from lae_sim.engine import Times, latest, simulate_lanes
 from lae_sim.evaluation import evaluate_groups
 from lae_sim.forecast import Hold
-from lae_sim.replay import Runs, bootstrap, replay_repeated
-from lae_sim.study.pairs import Member, pairs_of
+from lae_sim.replay import Repetitions, Runs, bootstrap
 
 RATES = (15, 20, 25, 30, 40, 50, 60, 90)  # frames/s of the trackers
 REPETITIONS = 81  # 9,963 lanes
@@ -293,11 +293,11 @@ def lane_lines(rounds: int) -> list[Line]:
             # fresh: it remembers how many it has handed out
             simulate(size, CLOCK, replace(times), latest)
 
-    def runs() -> Iterator[tuple[int, object]]:
-        return replay_repeated(drawn, REPETITIONS)
+    def runs() -> Iterator[object]:
+        return Repetitions(drawn, REPETITIONS).batches()
 
     def scored(replays: Runs) -> None:
-        those = (run for _, run in replay_repeated(replays, REPETITIONS))
+        those = Repetitions(replays, REPETITIONS)
         for _ in evaluate_groups(those, metadata, {"hold": Hold}, (Fraction(0),), frames=1 << 17):
             pass
 

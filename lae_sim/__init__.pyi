@@ -4,6 +4,7 @@ from .api.study import run_study
 from .datasets.layouts import find_dataset
 from .datasets.synthetic import synthetic_dataset
 from .decoding import max_decoded
+from .engine.pipeline import Camera, Pipeline, Stage
 from .engine.scheduler import simulate
 from .errors import LaeError, TraceError
 from .evaluation.evaluate import evaluate_runs
@@ -32,6 +33,7 @@ __version__: str
 __all__ = [
     "CONVENTIONS",
     "SIGMA_GRID",
+    "Camera",
     "ComparisonResult",
     "EvaluationResult",
     "Forecaster",
@@ -39,10 +41,12 @@ __all__ = [
     "Kalman",
     "LaeError",
     "Metadata",
+    "Pipeline",
     "Recording",
     "Run",
     "Runs",
     "Scene",
+    "Stage",
     "Study",
     "StudyResults",
     "Trace",

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from lae_sim.errors import LaeError, shown
 from lae_sim.files import check_regular
@@ -23,6 +24,7 @@ MAX_DECODED = "256MiB"
 
 _JSON_VALUE_BYTES = 80  # an empty list or dict, and its place in another
 _UNITS = {"": 0, "K": 10, "M": 20, "G": 30, "T": 40}
+_NESTED_KEY = re.compile(r"(?:[\w\"'-]+[ \t]*\.[ \t]*){32}")
 _SIZE = re.compile(r"([0-9]{1,15}) ?([KMGT]?)(?:i?B)?\Z")
 # As numpy.errstate: a setting of whoever calls, not of the process.
 _MAX_DECODED: ContextVar[int] = ContextVar("max_decoded", default=256 << 20)  # MAX_DECODED
@@ -117,6 +119,35 @@ def read_bytes(path: Path, budget: Budget) -> bytes:
         raise LaeError(f"{path}: no such file") from error
     except OSError as error:
         raise LaeError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def read_toml(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
+    """What a TOML file holds; numbers with a point stay text, as they are written.
+
+    Args:
+        path: of the file.
+        what: what it is, for messages, such as ``"a study"``.
+
+    Raises:
+        LaeError: if it cannot be read, or is not TOML; it names the file.
+    """
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+
+    try:
+        content = read_bytes(Path(path), Budget(path)).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise LaeError(f"{path}: cannot be read: {error}") from error
+    try:
+        if _NESTED_KEY.search(content):  # for which tomllib takes the square of its length
+            raise RecursionError
+        return tomllib.loads(content, parse_float=str)  # so that no float comes between
+    except RecursionError as error:
+        raise LaeError(f"{path}: is nested too deeply for {what}") from error
+    except ValueError as error:  # also of a number of thousands of digits
+        raise LaeError(f"{path}: {error}") from error
 
 
 def json_memory(text: bytes) -> int:

@@ -57,6 +57,12 @@ def test_replay(gaps: Path) -> None:
     (assumed,) = printed("replay", SLOW, *TWO, *each)["traces"]
     assert not assumed["search"]["c_known"]
     assert "mauc" in assumed["results"][0]
+    (piped,) = printed("replay", SLOW, *TWO, "--pipeline", TRACES / "pipeline.toml")["traces"]
+    assert [each["stage"] for each in piped["pipeline"]["stages"]] == [
+        "decode",
+        "tracker",
+        "publish",
+    ]
     (measured,) = printed("replay", SLOW, *TWO, "--strided", gaps, "--per-sequence")["traces"]
     assert measured["search"]["reach"]
     (exact,) = printed("replay", REAL_TIME)["traces"]

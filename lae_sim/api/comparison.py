@@ -29,7 +29,8 @@ from lae_sim.files import sequence_names
 from lae_sim.learning.registry import COMPARED, load_any, load_forecaster
 from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.latency import LatencySource
-from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, label_of, named, open_others
+from lae_sim.replay.names import label_of, named
+from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, open_others
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -177,6 +178,7 @@ class ComparisonResult:
         Raises:
             LaeError: if a file cannot be written.
         """
+        from lae_sim.figures.column import drawn
         from lae_sim.report.comparison import paper_tables
         from lae_sim.report.paper import Paper, write_paper
 
@@ -184,7 +186,8 @@ class ComparisonResult:
         attributes = self.attributes if self._names_attributes else None
         tables = paper_tables(self.summary, self.metrics, metadata, attributes)
         frames = {"scores": self.summary, "sequences": self.scores}
-        write_paper(Paper(self._figures(), tables, frames, documents or {}), folder)
+        figures = map(drawn, self._figures())
+        write_paper(Paper(figures, tables, frames, documents or {}), folder)
 
     @property
     def _names_attributes(self) -> bool:

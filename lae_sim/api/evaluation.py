@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from lae_sim._compiled import amount, expect
 from lae_sim.api.inputs import (
     Costs,
     Forecasters,
+    Pipelines,
     Traces,
     camera_of,
     check_frames,
@@ -40,9 +41,10 @@ from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.latency import LatencySource
+from lae_sim.replay.names import label_of, named
 from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import Run, Runs
-from lae_sim.replay.world import TraceLike, World, label_of, named, open_others, open_trace
+from lae_sim.replay.world import TraceLike, World, open_others, open_trace
 from lae_sim.report.replay import SequenceRows, attribute_members, paper_tables, trace_report
 from lae_sim.report.table import FINE_SCORE
 from lae_sim.trace.describe import InitCost
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from lae_sim._arrays import Floats
+    from lae_sim.evaluation.pipeline import PipelineTotals
     from lae_sim.figures.column import ColumnFigure
     from lae_sim.figures.lines import Panel
 
@@ -100,6 +103,12 @@ class Scenario:
         stalls = SkippedStalls()
         if self.world.times_kind == "recorded" and self.world.timing is None:
             observers = [*observers, stalls]
+        pipeline = None
+        if self.world.pipeline is not None:
+            from lae_sim.evaluation.pipeline import PipelineTotals
+
+            pipeline = PipelineTotals(self.world.pipeline, self.world.sigmas)
+            observers = [*observers, pipeline]
 
         def runs() -> Iterator[Run]:
             for run in self.runs:
@@ -126,7 +135,7 @@ class Scenario:
                 rows.add(part)
         notes = notes_on(totals.replay, metadata, convention, self.forecasters)
         notes += [*self.runs.notes(), *stalls.notes(), *cost_notes(self.costs)]
-        return Evaluated(self, totals, rows, tuple(notes))
+        return Evaluated(self, totals, rows, tuple(notes), pipeline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,12 +147,14 @@ class Evaluated:
         totals: its scores over all sequences, and over those of each attribute.
         rows: the scores of each sequence, if they were kept.
         notes: what keeps the scores from being what they seem, a sentence each.
+        pipeline: what happened at its stages; None where there is none.
     """
 
     scenario: Scenario
     totals: Totals
     rows: SequenceRows
     notes: tuple[str, ...]
+    pipeline: PipelineTotals | None = None
 
     @property
     def init(self) -> InitCost:
@@ -156,7 +167,7 @@ class Evaluated:
         scenario, world = self.scenario, self.scenario.world
         metadata, runs = scenario.trace.metadata, scenario.runs
         path = path_of(scenario.trace) or scenario.label
-        return {
+        document = {
             "trace": path,
             "tracker": metadata.tracker,
             "dataset": metadata.dataset,
@@ -168,7 +179,7 @@ class Evaluated:
             "times_note": runs.times.metadata.timing_note,
             "fps": str(runs.clock.fps),
             "arrivals": runs.arrivals,
-            "policy": label_of(world.policy),
+            "policy": world.policy_label,
             "latency": label_of(world.latency),
             "latency_scale": str(world.scale),
             "convention": world.convention,
@@ -185,6 +196,13 @@ class Evaluated:
                 attributes,
             ),
         }
+        if self.pipeline is not None:
+            document["pipeline"] = self.pipeline.report()
+            delays = {float(s): self.pipeline.answer_delay_ms(s) for s in world.sigmas}
+            for result in document["results"]:  # LAE's age knows no camera
+                result["capture_age_ms"] = result["age_ms"]
+                result["age_ms"] -= delays[result["sigma"]]
+        return document
 
 
 def scenarios(
@@ -414,12 +432,13 @@ class EvaluationResult:
         Raises:
             LaeError: if a file cannot be written.
         """
+        from lae_sim.figures.column import drawn
         from lae_sim.report.paper import Paper, write_paper
 
         document = self.document(attributes=True)
         write_paper(
             Paper(
-                figures_for_paper(self.parts),
+                map(drawn, figures_for_paper(self.parts)),
                 paper_tables(document["traces"], [part.scenario.label for part in self.parts]),
                 {"scores": self.summary, "sequences": self.to_frame()},
                 {"replay.json": document},
@@ -472,7 +491,7 @@ def _setting(scenario: Scenario) -> dict[str, Any]:
         metadata.tracker,
         metadata.dataset,
         scenario.label if timing is None else Path(path_of(timing) or timing.metadata.device).name,
-        label_of(world.policy),
+        world.policy_label,
         float(scenario.runs.clock.fps),
         label_of(world.latency),
         float(world.scale),
@@ -628,7 +647,7 @@ def figures_for_paper(
             yield ColumnFigure(
                 f"{_metric(panel)}-over-{swept[0]}-{panel.title}",
                 f"{panel.ylabel} over the {panel.xlabel}; {panel.title} {plotted.setting}",
-                panel_in_column(panel),
+                partial(panel_in_column, panel),
             )
     else:
         yield from curves_for_paper(plotted.curves(parts), plotted.setting)
@@ -638,7 +657,7 @@ def figures_for_paper(
                 yield ColumnFigure(
                     f"{_metric(panel)}-over-sigma-{name}",
                     f"{panel.ylabel} over the {panel.xlabel}; {part.scenario.label}",
-                    panel_in_column(panel),
+                    partial(panel_in_column, panel),
                 )
     first = parts[0].scenario
     if scores_latency(first.world.rule()) and not any(first.costs.values()):
@@ -667,6 +686,7 @@ def evaluate(
     camera_lag: int | None = None,
     progress: ShowProgress = None,
     forget_arrivals: bool = False,
+    pipeline: Pipelines = None,
 ) -> EvaluationResult:
     """Replay traces and score them, latency counted.
 
@@ -701,6 +721,7 @@ def evaluate(
             function, which is told: ``progress(done, total, what)``.
         forget_arrivals: let frames arrive evenly also where a trace says when each of them did,
             which is needed for another rate.
+        pipeline: stages around the tracker, or the path of a TOML file of them; or several.
 
     Raises:
         LaeError: if an argument is impossible, a file is missing, or a frame is asked for that a
@@ -727,6 +748,7 @@ def evaluate(
         pre_forecaster=pre_forecaster,
         keep_size=keep_size,
         forget_arrivals=forget_arrivals,
+        pipeline=pipeline,
         sigma=sigma,
         convention=convention,
         forecasters=makers,

@@ -15,11 +15,13 @@ from lae_sim.files import sequence_names
 from lae_sim.forecast.base import Hold, own_factory
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import find_camera
-from lae_sim.replay.world import TraceLike, named, open_trace, several
+from lae_sim.replay.names import named, several
+from lae_sim.replay.world import TraceLike, open_trace
 from lae_sim.trace.file import Trace
 from lae_sim.trace.locate import find_traces
 
 if TYPE_CHECKING:
+    from lae_sim.engine.pipeline import Pipeline
     from lae_sim.forecast.base import AnyFactory
     from lae_sim.forecast.camera import Camera
     from lae_sim.learning.folds import Trainer
@@ -32,6 +34,11 @@ Forecasters: TypeAlias = (
     "Mapping[str, str | AnyFactory | Trainer]"
 )
 """Forecasters by name, as classes or factories, or as a mapping from names to these."""
+
+Pipelines: TypeAlias = (
+    "Pipeline | str | os.PathLike[str] | Sequence[Pipeline | str | os.PathLike[str]] | None"
+)
+"""A pipeline, or the path of its file, or several."""
 
 Costs: TypeAlias = "str | Iterable[str] | Mapping[str, str]"
 """What forecasting costs: ``"2ms"``, ``"kalman=2ms"``, or ``{"kalman": "2ms"}``."""

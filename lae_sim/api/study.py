@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,14 +13,16 @@ from typing import Any
 from lae_sim import __version__
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
+from lae_sim.figures.column import drawn
 from lae_sim.figures.study import study_in_columns
-from lae_sim.files import text_digest
+from lae_sim.files import text_digest, written_whole
 from lae_sim.plugins import looking_in
 from lae_sim.progress import ProgressBar, ShowProgress
-from lae_sim.replay.world import named
-from lae_sim.report.page import write_report
+from lae_sim.replay.names import named
+from lae_sim.report.page import page_drawings, page_of, page_sections
 from lae_sim.report.paper import Paper, remove_paper, write_paper, written_before
 from lae_sim.report.study_tables import paper_tables
+from lae_sim.study.executors import RunAll, run_here
 from lae_sim.study.run import StudyResults, check_inputs, compute_study
 from lae_sim.study.spec import Study, read_study
 from lae_sim.study.store import Store
@@ -47,7 +51,8 @@ def run_study(
             themselves, such as ``traces="*.parquet", latencies=["recorded", "bootstrap"]``.
         folder: where results are kept; of a file ``STUDY-results``, else ``study-results``.
             Finished parts found there are not computed again.
-        workers: processes on this machine; by default one for each core. No result depends on it.
+        workers: processes on this machine; by default one for each core, or this one
+            alone where there is little to do. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead.
         report: whether to write ``report.html``, ``figures/`` and ``tables/`` too.
         root: folder of the dataset, for the report to show a few sequences with their images;
@@ -83,15 +88,15 @@ def run_study(
     if root is not None and not Path(root).expanduser().exists():
         raise LaeError(f"root: there is no {root}")
     made, base, kept = _asked_for(study, keys, folder)
-    with looking_in(base or "."):
-        with ProgressBar("study", "tasks", progress) as bar:
+    with looking_in(base or "."), ProgressBar("study", "tasks", progress) as bar:
 
-            def advance(what: str, done: int, total: int) -> None:
-                bar(done, total, what)
+        def advance(what: str, done: int, total: int) -> None:
+            bar(done, total, what)
 
-            results = compute_study(made, kept, base, workers, scheduler, advance)
-        write_views(results, report, root)
-    return results
+        def views(results: StudyResults, run: RunAll) -> None:
+            write_views(results, report, root, run)
+
+        return compute_study(made, kept, base, workers, scheduler, advance, views)
 
 
 def _asked_for(
@@ -117,26 +122,61 @@ def _asked_for(
 
 
 def write_views(
-    results: StudyResults, report: bool = True, root: str | os.PathLike[str] | None = None
+    results: StudyResults,
+    report: bool = True,
+    root: str | os.PathLike[str] | None = None,
+    run: RunAll = run_here,
 ) -> None:
     """Write the report and what a paper needs beside a study's results, or take old ones away.
 
     What was written of the same results, and is as it was written, is not written again; but with
-    frames, which may have changed.
+    frames, which may have changed. Workers draw, while the tables are written here.
     """
     page = results.folder / "report.html"
-    if report:
-        if root is None and _are_there(results):
-            return
-        view = View(results)
-        frames = {"scores": view.results.scores_frame()}
-        write_paper(Paper(study_in_columns(view), paper_tables(view), frames), results.folder)
-        write_report(view, page, root)
-        if root is None:
-            Store(results.folder).keep(VIEWS, _views(results))
+    if not report:
+        remove_paper(results.folder)  # it would be of other results
+        page.unlink(missing_ok=True)
         return
-    remove_paper(results.folder)  # it would be of other results
-    page.unlink(missing_ok=True)
+    if root is None and _are_there(results):
+        return
+    view = View(results)
+    sections, figures = page_sections(view, root), [*study_in_columns(view)]
+    pictures = page_drawings(sections)
+    jobs: list[Callable[[], Any]] = [partial(drawn, figure) for figure in figures]
+    jobs += pictures.values()
+    with _being_done(jobs, run) as done:
+        tables, frames = paper_tables(view), {"scores": view.results.scores_frame()}
+        made = done()
+    count = len(figures)
+    write_paper(Paper(made[:count], tables, frames), results.folder)
+    with written_whole(page) as temporary:
+        text = page_of(view, sections, dict(zip(pictures, made[count:])))
+        temporary.write_text(text, "utf-8", "backslashreplace")
+    if root is None:
+        Store(results.folder).keep(VIEWS, _views(results))
+
+
+@contextmanager
+def _being_done(
+    jobs: Sequence[Callable[[], Any]], run: RunAll
+) -> Iterator[Callable[[], list[Any]]]:
+    """What waits for the results of jobs, which workers, if there are any, do meanwhile."""
+
+    def all_done() -> list[Any]:
+        with closing(run(_done, [*enumerate(jobs)])) as results:
+            found = {number: result for (number, _), result in results}
+        return [found[number] for number in range(len(jobs))]
+
+    if run is run_here:
+        yield all_done
+    else:
+        with ThreadPoolExecutor(1) as beside:  # which waits for the workers
+            yield beside.submit(all_done).result
+
+
+def _done(numbered: tuple[int, Callable[[], Any]]) -> Any:
+    """What a job gives, on a worker."""
+    return numbered[1]()
 
 
 def _are_there(results: StudyResults) -> bool:

@@ -381,7 +381,7 @@ def check_outputs(
             yield from [value] if isinstance(value, str) else value or ()
 
     written = [path for path in outputs if path]
-    read = [*traces, *given("trace", "closed_loop", "strided", "timing", "root")]
+    read = [*traces, *given("trace", "closed_loop", "strided", "timing", "root", "pipeline")]
     for name in given("forecaster", "pre_forecaster", "latency", "policy"):
         read += files_named(name)
     check_distinct(written, read)
@@ -419,7 +419,8 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
         LaeError: if there is no such policy or latency, or some do not go together.
     """
     from lae_sim.replay.latency import scaled
-    from lae_sim.replay.world import World, parse_latency, parse_policy, several
+    from lae_sim.replay.names import parse_latency, parse_policy, several
+    from lae_sim.replay.world import World
 
     parse_policy(arguments.policy)  # what is wrong with an option is said without its Python name
     for latency, scale in product(several(arguments.latency), several(arguments.latency_scale)):
@@ -434,6 +435,7 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
         search=getattr(arguments, "search", "off"),
         pre_forecaster=getattr(arguments, "pre_forecaster", None),
         keep_size=getattr(arguments, "keep_size", False),
+        pipeline=getattr(arguments, "pipeline", None) or None,
         forget_arrivals=arguments.forget_arrivals,
         **scores,
     )

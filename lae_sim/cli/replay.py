@@ -45,6 +45,7 @@ examples:
   lae-sim replay trace.parquet --fps 15 30 60 --latency-scale 1/2 1 2 --plot sweep.png
   lae-sim replay trace.parquet --latency constant:47ms,init=800ms --strided trace.gaps.parquet
   lae-sim replay trace.parquet --latency constant:47ms --search c=0.7 --pre-forecaster kalman
+  lae-sim replay trace.parquet --pipeline drone.toml          from the camera to the command
   lae-sim replay a.parquet b.parquet --latency-scale 2 --json | jq '.traces[].results[].auc'
   lae-sim replay a.parquet b.parquet --sigma-grid --out paper       figures and tables in a folder
   lae-sim replay trace.parquet --forecaster my_package.my_module:MyForecaster --per-sequence
@@ -88,6 +89,14 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("traces", nargs="+", metavar="TRACE", help="traces (see traces/FORMAT.md), folders, URLs")
     add_world(made, sweeps=True)
+    add(
+        "--pipeline",
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="replay the stages of a TOML file, from the camera to the command; or of several "
+        "files, one after another",
+    )
     add_search(made)
     scores = made.add_argument_group("forecasting and scores")
     add = scores.add_argument
@@ -162,6 +171,7 @@ def _replay(arguments: argparse.Namespace) -> None:
         setattr(arguments, name, list(dict.fromkeys(getattr(arguments, name))))
     arguments.traces = find_traces(arguments.traces)
     swept = [name for name in ("fps", "latency_scale") if len(getattr(arguments, name)) > 1]
+    swept += ["policy"] if len(arguments.pipeline) > 1 else []
     _check_files(arguments, swept)
     worlds = worlds_of(
         arguments,
@@ -224,7 +234,9 @@ def _check_files(arguments: argparse.Namespace, swept: Sequence[str]) -> None:
         raise LaeError(f"--{asked[0]} takes one trace at a time")
     asked += ["export-txt"] if arguments.export_txt else []
     if asked and swept:
-        raise LaeError(f"--{asked[0]} takes one frame rate and one scale of the times at a time")
+        raise LaeError(
+            f"--{asked[0]} takes one frame rate, scale of the times and pipeline at a time"
+        )
     if arguments.strided and len(arguments.traces) > 1:
         raise LaeError("--strided goes with one trace at a time")
     outputs = [*(getattr(arguments, name) for name in _FILES), arguments.plot, arguments.out]
@@ -277,6 +289,7 @@ def _print_tables(
     from lae_sim.report.replay import (
         attribute_table,
         closing_text,
+        pipeline_text,
         sequence_table,
         settings_text,
         summary_table,
@@ -291,5 +304,7 @@ def _print_tables(
     print_text(summary_table(reports, trace_labels, shown, swept, width), end="\n\n")
     for each in reports:
         print_text(settings_text(each))
+        if "pipeline" in each:
+            print_text(f"\n{pipeline_text(each, width)}\n")
     if closing := closing_text(reports, trace_labels, swept):
         print_text(closing)

@@ -20,9 +20,9 @@ from lae_sim.evaluation.metrics import find_convention
 from lae_sim.evaluation.modelled import MODELLED
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import load_forecaster
+from lae_sim.replay.names import parse_policy
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.search import SearchModel, find_search
-from lae_sim.replay.world import parse_policy
 from lae_sim.trace.file import Trace, held, read_trace
 from lae_sim.trace.restarts import RestartName
 

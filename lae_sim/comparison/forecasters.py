@@ -22,9 +22,10 @@ from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import cost_notes, resolve_costs
 from lae_sim.forecast.kalman import TunedKalman
 from lae_sim.learning.folds import Examples, Trainer, assign_folds, cross_fitted
+from lae_sim.replay.names import label_of
 from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import Runs
-from lae_sim.replay.world import RECORDED, SIGMA_GRID, World, label_of, open_trace
+from lae_sim.replay.world import RECORDED, SIGMA_GRID, World, open_trace
 from lae_sim.trace.describe import InitCost
 from lae_sim.trace.file import Trace
 

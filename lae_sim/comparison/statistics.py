@@ -129,23 +129,33 @@ class Bootstrap:
         """The range between the tails of samples (see :func:`quantiles`)."""
         return Interval(*quantiles(samples, self.tails, middle, spread))
 
-    def compare(
-        self, values: Floats, baseline: Floats | float, means: Floats, others: Floats | float
-    ) -> Difference:
-        """The paired difference of scores to a baseline's.
+    def differences(
+        self,
+        values: Floats,
+        baselines: Floats,
+        means: Iterable[Floats],
+        others: Iterable[Floats | float],
+    ) -> list[Difference]:
+        """The paired differences of some scores, each to a baseline's.
 
         Args:
-            values, baseline: scores by sequence, float64 [S]; or differences, and 0.
-            means, others: their means in each resample, float64 [resamples].
+            values, baselines: scores by sequence, float64 [F, S]; or differences, and 0.
+            means, others: of each the means in the resamples, float64 [resamples].
         """
-        differences = np.round(values - baseline, _NOISE_DECIMALS)
-        return Difference(
-            value=float(np.mean(values) - np.mean(baseline)),
-            interval=self.interval(means - others),
-            p=signed_rank_p(differences),
-            better=int((differences > 0).sum()),
-            worse=int((differences < 0).sum()),
-        )
+        margins = values - baselines
+        rounded = np.round(margins, _NOISE_DECIMALS)
+        return [
+            Difference(
+                value=float(np.mean(value) - np.mean(baseline)),
+                interval=self.interval(mean - other, *spread(margin)),
+                p=p,
+                better=int((change > 0).sum()),
+                worse=int((change < 0).sum()),
+            )
+            for value, baseline, mean, other, margin, change, p in zip(
+                values, baselines, means, others, margins, rounded, signed_rank_ps(rounded)
+            )
+        ]
 
     def recover(self, won: float, lost: float, wins: Floats, losses: Floats) -> Recovered:
         """The share of a loss that is won back.
@@ -156,6 +166,11 @@ class Bootstrap:
         """
         shares = self.interval(wins / losses) if (losses > 0).all() else None
         return Recovered(recovered(won, lost), shares)
+
+
+def spread(values: Floats) -> tuple[float, float]:
+    """About where the means of values, float64 [S], are in resamples: their mean and deviation."""
+    return float(values.mean()), float(values.std()) / math.sqrt(len(values))
 
 
 def quantiles(
@@ -371,11 +386,13 @@ def _summary_rows(
             "high": interval.high,
         }
         for baseline in baselines:
-            b = place.get(baseline)
-            row |= _difference_columns(
-                f"vs_{baseline}",
-                None if b is None else bootstrap.compare(scores[f], scores[b], means[f], means[b]),
-            )
+            b, difference = place.get(baseline), None
+            if b is not None:
+                one, other = slice(f, f + 1), slice(b, b + 1)
+                [difference] = bootstrap.differences(
+                    scores[one], scores[other], means[one], means[other]
+                )
+            row |= _difference_columns(f"vs_{baseline}", difference)
         share, ends = None, None
         if hold is not None and offline is not None:
             won, lost = (float(scores[i].mean() - scores[hold].mean()) for i in (f, offline))

@@ -156,11 +156,14 @@ def _stretches(
     begin = 0
     for end in [*np.flatnonzero(calls < 1).tolist(), len(calls)]:
         if begin < end:
+            frames, starts, ready = rows[:, offsets[begin] : offsets[end]]
             yield Schedules(
                 (clock,) * (end - begin),
                 np.array(lengths[begin:end], np.int64),
                 offsets[begin : end + 1] - offsets[begin],
-                *rows[:, offsets[begin] : offsets[end]],
+                frames,
+                starts,
+                ready,
                 np.full(end - begin, scored),
             )
         if end < len(calls):

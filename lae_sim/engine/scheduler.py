@@ -1,6 +1,7 @@
 """The scheduler: which frames a busy tracker processes, and when its outputs are ready.
 
-This is the only scheduler in the package. A *service* says how long a frame takes (a live tracker
+This is the scheduler of one tracker that takes its frames itself; :mod:`.engine.stages` is that of
+whole pipelines. A *service* says how long a frame takes (a live tracker
 runs and is timed; a recorded one looks the time up), a *policy* says which frame is next, and
 SimPy moves the clock. See Li et al., "Predictive Visual Tracking" (2021), Eqs. 3 and 4.
 """
@@ -43,6 +44,10 @@ from the arrival of their own frames (see :class:`Schedule`).
 """
 
 
+NEVER = 2**62
+"""A tick that never comes."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Schedule:
     """What one sequence's processing looked like, in processing order.
@@ -55,6 +60,9 @@ class Schedule:
         ready: when each output became available, int64 [n], ticks.
         scores_latency: whether an output counts only once it is ready, as the policy has it; False
             under the VOT toolkit's rule, which lets it count from its own frame's arrival.
+        visible: from when each output answers queries, int64 [n], ticks, never decreasing;
+            ``NEVER`` for one that never does. None: from when it is ready. Stages after a tracker
+            make it later (see :class:`.stages.PipelineSchedule`).
     """
 
     clock: Clock
@@ -63,6 +71,7 @@ class Schedule:
     start: Ints
     ready: Ints
     scores_latency: bool = True
+    visible: Ints | None = None
 
     def __repr__(self) -> str:
         processed = f"{len(self.frames):,} of {self.length:,} frames processed"
@@ -85,6 +94,7 @@ class Schedules:
         offsets: first call of each, and n: int64 [S + 1].
         frames, start, ready: see :class:`Schedule`, int64 [n].
         scores_latency: of each sequence, bool [S].
+        whole: each by itself, where they know more than that; None where they do not.
     """
 
     clocks: tuple[Clock, ...]
@@ -94,6 +104,7 @@ class Schedules:
     start: Ints
     ready: Ints
     scores_latency: Bools
+    whole: tuple[Schedule, ...] | None = None
 
     def __len__(self) -> int:
         """Number of sequences S."""
@@ -101,6 +112,8 @@ class Schedules:
 
     def __getitem__(self, s: int) -> Schedule:
         """That of one sequence."""
+        if self.whole is not None:
+            return self.whole[s]
         calls = slice(int(self.offsets[s]), int(self.offsets[s + 1]))
         columns = self.frames[calls], self.start[calls], self.ready[calls]
         return Schedule(
@@ -110,6 +123,14 @@ class Schedules:
     def __iter__(self) -> Iterator[Schedule]:
         """Each, in order."""
         return map(self.__getitem__, range(len(self)))
+
+    @property
+    def visible(self) -> Ints:
+        """From when each output answers queries, int64 [n], ticks; see :class:`Schedule`."""
+        if self.whole is None:
+            return self.ready
+        each = [one.ready if one.visible is None else one.visible for one in self.whole]
+        return np.concatenate(each)
 
     def part(self, begin: int, end: int) -> Schedules:
         """Those of some sequences, one after another."""
@@ -123,6 +144,7 @@ class Schedules:
             self.start[calls],
             self.ready[calls],
             self.scores_latency[some],
+            None if self.whole is None else self.whole[some],
         )
 
     @classmethod
@@ -137,6 +159,7 @@ class Schedules:
             np.concatenate([each.start for each in schedules]),
             np.concatenate([each.ready for each in schedules]),
             np.array([each.scores_latency for each in schedules]),
+            None if all(each.visible is None for each in schedules) else tuple(schedules),
         )
 
     @classmethod
@@ -151,6 +174,7 @@ class Schedules:
             np.concatenate([part.start for part in parts]),
             np.concatenate([part.ready for part in parts]),
             np.concatenate([part.scores_latency for part in parts]),
+            None if all(part.whole is None for part in parts) else tuple(chain(*parts)),
         )
 
 

@@ -12,6 +12,55 @@ from lae_sim._arrays import Bools, Floats, Frames, Ints
 from lae_sim._compiled import kernel
 from lae_sim.forecast.kernels import overlap
 
+_AT_ONCE = 256  # pairs whose boxes stay in the first cache
+
+
+@kernel
+def first_steps(ready: Ints, interval: int, scale: int, steps: Ints) -> None:
+    """The step from which each output is visible: ceil(scale * ready / interval).
+
+    Args:
+        ready: ticks, int64 [n].
+        interval: ticks of a frame.
+        scale: see :class:`.pairing.Pairing`.
+        steps: written, int64 [n].
+    """
+    for o in range(len(ready)):
+        frame = ready[o] // interval
+        late = ready[o] - frame * interval
+        steps[o] = frame * scale - (-late * scale // interval)
+
+
+@kernel
+def first_visible(
+    steps: Ints,
+    offsets: Ints,
+    lengths: Ints,
+    scale: int,
+    whole: Ints,
+    part: Ints,
+    first: Frames,
+    end: Frames,
+) -> None:
+    """Where each output answers first, and no longer; see :func:`.pairing._first_visible`.
+
+    Args:
+        steps, offsets, lengths, scale: see :class:`.pairing.Pairing`.
+        whole, part: the permitted latencies in whole frames, and the steps beyond, int64 [M].
+        first, end: see :class:`.pairing.Pairing`: written, int32 [n, M].
+    """
+    for s in range(len(lengths)):
+        length = lengths[s]
+        for o in range(offsets[s], offsets[s + 1]):
+            frame = steps[o] // scale
+            rest = steps[o] - frame * scale
+            for m in range(len(whole)):
+                since = min(max(frame - whole[m] + (rest > part[m]), 0), length)
+                first[o, m] = since
+                end[o, m] = length
+                if o > offsets[s]:
+                    end[o - 1, m] = since
+
 
 @kernel
 def sum_gaps(
@@ -151,7 +200,8 @@ def list_pairs(
 @kernel
 def _within(value: float, most: float) -> float:
     """A number as one from 0 to the most, which NaN becomes."""
-    return max(value, 0.0) if value < most else most
+    value = value if value < most else most
+    return value if value > 0.0 else 0.0
 
 
 @kernel
@@ -159,6 +209,73 @@ def _below(value: float, steps: int) -> float:
     """See :func:`.metrics._below`."""
     whole = float(np.floor(value * steps))
     return whole + 1.0 if whole / steps < value else whole
+
+
+@kernel
+def _measure(
+    truth: Floats,
+    boxes: Floats,
+    count: int,
+    valid: int,
+    leaves_out: bool,
+    by_centre: bool,
+    steps: int,
+    worth: Floats,
+) -> None:
+    """What pairs count, in a loop that compilers turn to vector instructions.
+
+    Args:
+        truth, boxes: columns, float64 [4, ...].
+        count: how many pairs.
+        valid, leaves_out, by_centre, steps: see :func:`count_pairs`.
+        worth: success, precision and norm of :class:`.metrics.FrameCounts`, and 1 for ``norm_dp``,
+            with 2 more for ``apart``: written, float64 [4, ...].
+    """
+    # by rows, which the compiler can see not to overlap
+    x_, y_, w_, h_ = truth[0], truth[1], truth[2], truth[3]
+    x1_, y1_, w1_, h1_ = boxes[0], boxes[1], boxes[2], boxes[3]
+    success, precision, norm, flags = worth[0], worth[1], worth[2], worth[3]
+    missed = np.inf if leaves_out else -1.0
+    for k in range(count):
+        x, y, w, h = x_[k], y_[k], w_[k], h_[k]
+        x1, y1, w1, h1 = x1_[k], y1_[k], w1_[k], h1_[k]
+        counts = (w > 0) & (h > 0)
+        if valid == 1:
+            counts &= (x > 0) & (y > 0)
+        elif valid == 2:
+            counts = (x == x) & (y == y) & (w == w) & (h == h)
+        shared = overlap((x, y, w, h), (x1, y1, w1, h1))
+        shared = shared if counts else 0.0
+
+        centre_x, centre_y = x + (w - 1.0) / 2.0, y + (h - 1.0) / 2.0
+        off_x, off_y = x1 + (w1 - 1.0) / 2.0 - centre_x, y1 + (h1 - 1.0) / 2.0 - centre_y
+        counts_centre = counts
+        if by_centre and not leaves_out:
+            counts_centre = (centre_x > 0) & (centre_y > 0)
+        error = np.sqrt(off_x * off_x + off_y * off_y)
+        off_x = off_x / w if w > 0 else np.nan
+        off_y = off_y / h if h > 0 else np.nan
+        norm_error = np.sqrt(off_x * off_x + off_y * off_y)
+        error = _within(error if counts_centre else missed, 51.0)
+        norm_error = _within(norm_error if counts_centre else missed, 1.0)
+        above = _below(norm_error, 100)
+
+        success[k] = _below(shared, steps)
+        precision[k] = 51.0 - np.ceil(error)
+        norm[k] = 51.0 - (above if above < 51.0 else 51.0)
+        apart = counts & (shared == 0)
+        flags[k] = (1.0 if norm_error <= 0.20 else 0.0) + (2.0 if apart else 0.0)
+
+
+@kernel
+def _add(
+    sums: Ints, s: int, m: int, auc: int, dp20: int, norm_dp20: int, norm_auc: int, within50: int
+) -> None:
+    sums[s, m, 0] += auc
+    sums[s, m, 1] += dp20
+    sums[s, m, 2] += norm_dp20
+    sums[s, m, 3] += norm_auc
+    sums[s, m, 4] += within50
 
 
 @kernel
@@ -194,53 +311,42 @@ def count_pairs(
         curves_at: index of a permitted latency.
         sums, success, precision, failure: see :class:`.scoring._Tally`.
     """
-    for p in range(len(frame)):
-        s, i = sequence[p], frame[p]
-        at = bases[s] + i
-        x, y, w, h = truth[0, at], truth[1, at], truth[2, at], truth[3, at]
-        x1, y1, w1, h1 = boxes[p, 0], boxes[p, 1], boxes[p, 2], boxes[p, 3]
-        if first_frame_is_truth and i == 0:
-            x1, y1, w1, h1 = x, y, w, h
-        if valid == 0:
-            counts = w > 0 and h > 0
-        elif valid == 1:
-            counts = x > 0 and y > 0 and w > 0 and h > 0
-        else:
-            counts = not (np.isnan(x) or np.isnan(y) or np.isnan(w) or np.isnan(h))
-        shared = overlap((x, y, w, h), (x1, y1, w1, h1)) if counts else 0.0
-        auc = int(_below(shared, steps))
-
-        centre_x, centre_y = x + (w - 1.0) / 2.0, y + (h - 1.0) / 2.0
-        off_x, off_y = x1 + (w1 - 1.0) / 2.0 - centre_x, y1 + (h1 - 1.0) / 2.0 - centre_y
-        counts_centre = counts
-        if by_centre and not leaves_out:
-            counts_centre = centre_x > 0 and centre_y > 0
-        if counts_centre:
-            error = np.sqrt(off_x * off_x + off_y * off_y)
-            off_x = off_x / w if w > 0 else np.nan
-            off_y = off_y / h if h > 0 else np.nan
-            norm_error = np.sqrt(off_x * off_x + off_y * off_y)
-        else:
-            error = norm_error = np.inf if leaves_out else -1.0
-        norm_error = _within(norm_error, 1.0)
-        within = 51 - int(np.ceil(_within(error, 51.0)))
-
-        begin, end = sums[s, sigma_from[p]], sums[s, sigma_to[p]]
-        norm_auc = 51 - min(int(_below(norm_error, 100)), 51)
-        dp20, norm_dp20, within50 = int(within > 30), int(norm_error <= 0.20), int(within > 0)
-        begin[0] += auc
-        begin[1] += dp20
-        begin[2] += norm_dp20
-        begin[3] += norm_auc
-        begin[4] += within50
-        end[0] -= auc
-        end[1] -= dp20
-        end[2] -= norm_dp20
-        end[3] -= norm_auc
-        end[4] -= within50
-        if sigma_from[p] <= curves_at < sigma_to[p]:
-            success[s, auc] += 1
-            precision[s, within] += 1
-        if counts and shared == 0:
-            for m in range(sigma_from[p], sigma_to[p]):
-                failure[s, m] = min(failure[s, m], i)
+    known, answered = np.empty((4, _AT_ONCE)), np.empty((4, _AT_ONCE))
+    worth = np.empty((4, _AT_ONCE))
+    s = low = high = 0
+    shown = False
+    auc = dp20 = norm_dp20 = norm_auc = within50 = 0  # of pairs in a row of the same sigmas
+    for begin in range(0, len(frame), _AT_ONCE):
+        count = min(_AT_ONCE, len(frame) - begin)
+        for k in range(count):
+            p = begin + k
+            at = bases[sequence[p]] + frame[p]
+            known[0, k], known[1, k] = truth[0, at], truth[1, at]
+            known[2, k], known[3, k] = truth[2, at], truth[3, at]
+            answered[0, k], answered[1, k] = boxes[p, 0], boxes[p, 1]
+            answered[2, k], answered[3, k] = boxes[p, 2], boxes[p, 3]
+            if first_frame_is_truth and frame[p] == 0:
+                answered[:, k] = known[:, k]
+        _measure(known, answered, count, valid, leaves_out, by_centre, steps, worth)
+        for k in range(count):
+            p = begin + k
+            if sequence[p] != s or sigma_from[p] != low or sigma_to[p] != high:
+                _add(sums, s, low, auc, dp20, norm_dp20, norm_auc, within50)
+                _add(sums, s, high, -auc, -dp20, -norm_dp20, -norm_auc, -within50)
+                auc = dp20 = norm_dp20 = norm_auc = within50 = 0
+                s, low, high = sequence[p], sigma_from[p], sigma_to[p]
+                shown = low <= curves_at < high
+            passed, within, flags = int(worth[0, k]), int(worth[1, k]), int(worth[3, k])
+            auc += passed
+            dp20 += within > 30
+            norm_dp20 += flags & 1
+            norm_auc += int(worth[2, k])
+            within50 += within > 0
+            if shown:
+                success[s, passed] += 1
+                precision[s, within] += 1
+            if flags > 1:
+                for m in range(low, high):
+                    failure[s, m] = min(failure[s, m], frame[p])
+    _add(sums, s, low, auc, dp20, norm_dp20, norm_auc, within50)
+    _add(sums, s, high, -auc, -dp20, -norm_dp20, -norm_auc, -within50)

@@ -22,7 +22,7 @@ import numpy as np
 from lae_sim._arrays import Bools, Floats, Frames, Ints
 from lae_sim._compiled import compiled
 from lae_sim.engine.clock import MAX_INT64, Clock
-from lae_sim.engine.scheduler import Schedule, Schedules
+from lae_sim.engine.scheduler import NEVER, Schedule, Schedules
 from lae_sim.errors import LaeError
 
 MOST_FRAMES = 2**29  # keeps sums of two frame numbers in 32 bits
@@ -258,7 +258,8 @@ def pair(
     if cost_ns < 0:
         raise LaeError(f"forecasting cannot cost {cost_ns} ns, less than nothing")
     cost = cost_ns * clocks[0].ticks_per_ns
-    last_ready = int(schedules.ready[offsets[1:] - 1].max()) + cost
+    visible = schedules.visible
+    last_ready = int(visible[visible < NEVER].max()) + cost
     if last_ready > MAX_INT64:
         raise LaeError(f"forecasting cannot cost {cost_ns:g} ns: the clock ends before")
     largest = max(last_ready // interval, int(lengths.max())) * scale
@@ -271,7 +272,7 @@ def pair(
     frames = schedules.frames
     overlaps = schedules.start[1:] < schedules.ready[:-1]
     overlaps[offsets[1:-1] - 1] = False
-    if not at_once and overlaps.any():
+    if not at_once and schedules.whole is None and overlaps.any():
         raise LaeError(
             "calls overlap, as under the rule of VOT, which never scores latency: such a policy "
             "says so by an attribute, scores_latency = False"
@@ -283,12 +284,12 @@ def pair(
         if at_once:
             steps = frames * scale
         else:
-            frame, rest = np.divmod(schedules.ready + cost, interval)
-            steps = frame * scale - (-rest * scale // interval)
+            steps = _steps(visible + cost, interval, scale)
+            steps[visible == NEVER] = _NEVER
         steps[offsets[:-1]] = -_NEVER
         next_steps = np.append(steps[1:], _NEVER)
         next_steps[offsets[1:] - 1] = _NEVER
-        first = _first_visible(steps, m, scale, np.repeat(lengths, np.diff(offsets)))
+        first, end = _first_visible(steps, m, scale, offsets, lengths)
     else:
         permitted = [each * interval // scale for each in numerators]
         if last_ready + max(map(abs, permitted)) > MAX_INT64:
@@ -296,13 +297,11 @@ def pair(
         since = np.array(permitted, np.int64)
         first = np.concatenate(
             [
-                _first_arrived(s, s.clock.arrival(s.frames) if at_once else s.ready + cost, since)
-                for s in schedules
+                _first_arrived(s, s.clock.arrival(s.frames) if at_once else seen + cost, since)
+                for s, seen in zip(schedules, np.split(visible, offsets[1:-1]))
             ]
         )
-    end = np.empty_like(first)
-    end[:-1] = first[1:]
-    end[offsets[1:] - 1] = lengths[:, None]
+        end = _ends(first, offsets, lengths)
     return Pairing(lengths, offsets, frames, steps, next_steps, scale, m, first, end, clocks)
 
 
@@ -320,13 +319,38 @@ def _first_arrived(schedule: Schedule, visible: Ints, permitted: Ints) -> Frames
     return first
 
 
-def _first_visible(steps: Ints, sigmas: Ints, scale: int, lengths: Ints) -> Frames:
-    """ceil((K - m) / b), within 0..T, for each output and sigma; without a division for each."""
-    frame, rest = np.divmod(steps, scale)
+def _steps(ready: Ints, interval: int, scale: int) -> Ints:
+    """The step from which each output is visible, without the rule for the initial box."""
+    if compiled():
+        from lae_sim.evaluation.kernels import first_steps
+
+        steps = np.empty_like(ready)
+        first_steps(ready, interval, scale, steps)
+        return steps
+    frame, rest = np.divmod(ready, interval)
+    rounded_up: Ints = frame * scale - (-rest * scale // interval)
+    return rounded_up
+
+
+def _first_visible(
+    steps: Ints, sigmas: Ints, scale: int, offsets: Ints, lengths: Ints
+) -> tuple[Frames, Frames]:
+    """ceil((K - m) / b), within 0..T, for each output and sigma, and where the next one's is.
+
+    There is no division for each sigma.
+    """
     whole, part = np.divmod(sigmas, scale)
-    frame = np.clip(frame, -MOST_FRAMES, MOST_FRAMES).astype(np.int32)[:, None]
-    rest, whole, limit = rest[:, None], whole.astype(np.int32), lengths.astype(np.int32)[:, None]
     first = np.empty((len(steps), len(sigmas)), np.int32)
+    if compiled():
+        from lae_sim.evaluation.kernels import first_visible
+
+        end = np.empty_like(first)
+        first_visible(steps, offsets, lengths, scale, whole, part, first, end)
+        return first, end
+    frame, rest = np.divmod(steps, scale)
+    frame = np.clip(frame, -MOST_FRAMES, MOST_FRAMES).astype(np.int32)[:, None]
+    limit = np.repeat(lengths, np.diff(offsets)).astype(np.int32)[:, None]
+    rest, whole = rest[:, None], whole.astype(np.int32)
     rows = max(_CELLS // len(sigmas), 1)
     for begin in range(0, len(steps), rows):
         now = slice(begin, begin + rows)
@@ -334,7 +358,15 @@ def _first_visible(steps: Ints, sigmas: Ints, scale: int, lengths: Ints) -> Fram
         some += rest[now] > part
         np.maximum(some, 0, out=some)
         np.minimum(some, limit[now], out=some)
-    return first
+    return first, _ends(first, offsets, lengths)
+
+
+def _ends(first: Frames, offsets: Ints, lengths: Ints) -> Frames:
+    """Where each output is no longer the latest: where the next one is first, or at the end."""
+    end = np.empty_like(first)
+    end[:-1] = first[1:]
+    end[offsets[1:] - 1] = lengths[:, None]
+    return end
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ They have no title: the paper's caption says what they show. The same figure giv
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
-from lae_sim.figures.style import any_names, new_figure
+from lae_sim.figures.style import any_names, laid_out, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 COLUMN = 3.4
 """Inches: what fits a column of the usual two-column papers."""
 
-KINDS = ("pdf", "svg")
 _LEGEND_ROW, _CHARACTER = 0.135, 0.058  # inches that a row and a letter of a legend take
 _LOOK = {
     "text.parse_math": False,  # names hold what they hold
@@ -52,17 +51,37 @@ _FILES = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "lae_sim"}
 
 @dataclass(frozen=True, eq=False)
 class ColumnFigure:
+    """A figure for a paper, not yet drawn.
+
+    Attributes:
+        name: of its files.
+        caption: what it shows, and what was chosen of more.
+        draw: draws it; can be pickled where workers are to.
+    """
+
+    name: str
+    caption: str
+    draw: Callable[[], Figure]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnFigure:
     """A figure for a paper.
 
     Attributes:
         name: of its files.
         caption: what it shows, and what was chosen of more.
-        figure: the figure.
+        files: by their endings, ``"pdf"`` and ``"svg"``.
     """
 
     name: str
     caption: str
-    figure: Figure
+    files: Mapping[str, bytes]
+
+
+def drawn(figure: ColumnFigure) -> DrawnFigure:
+    """A figure, drawn."""
+    return DrawnFigure(figure.name, figure.caption, column_files(figure.draw()))
 
 
 def field_score(value: float | None) -> str:
@@ -103,24 +122,19 @@ def column_figure(
     return figure
 
 
-def write_column_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure as PDF and SVG, of the same bytes each time.
-
-    Raises:
-        OSError: if one cannot be written.
-    """
+def column_files(figure: Figure) -> dict[str, bytes]:
+    """A figure as files by their endings, ``"pdf"`` and ``"svg"``: of the same bytes each time."""
     import matplotlib
+    from matplotlib.backends.backend_pdf import FigureCanvasPdf
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     settings: dict[Any, Any] = {**_LOOK, **_FILES}
-    metadata: dict[str, dict[str, Any]] = {
-        "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
-        "svg": {"Date": None, "Creator": None},
-    }
-    paths = [folder / f"{name}.{kind}" for kind in KINDS]
+    pdf, svg = BytesIO(), BytesIO()
     with matplotlib.rc_context(settings), any_names(figure):
-        if (engine := figure.get_layout_engine()) is not None:
-            engine.execute(figure)  # once for both
-        figure.set_layout_engine("none")
-        for kind, path in zip(KINDS, paths):
-            figure.savefig(path, format=kind, metadata=metadata[kind], dpi=300)
-    return paths
+        laid_out(figure)  # once for both
+        nothing = dict.fromkeys(("CreationDate", "Creator", "Producer"))
+        canvas: Any = FigureCanvasPdf(figure)
+        canvas.print_pdf(pdf, metadata=nothing)
+        canvas = FigureCanvasSVG(figure)
+        canvas.print_svg(svg, metadata=dict.fromkeys(("Date", "Creator")))
+    return {"pdf": pdf.getvalue(), "svg": svg.getvalue()}

@@ -129,14 +129,14 @@ def comparison_in_columns(summary: pd.DataFrame, metrics: Sequence[str]) -> Iter
             yield ColumnFigure(
                 f"{metric}-{trace}",
                 f"{_label(metric)} of forecasters on {trace}, with 95 % intervals over sequences",
-                column_figure(partial(draw, rows=rows)),
+                partial(column_figure, partial(draw, rows=rows)),
             )
             if metric == metrics[0] and recovers(rows):
                 yield ColumnFigure(
                     f"recovered-{metric}-{trace}",
                     f"Share of the {_label(metric)} lost to latency that forecasters recover on "
                     f"{trace}, with 95 % intervals over sequences",
-                    column_figure(partial(_draw_all_shares, rows, settings, styles)),
+                    partial(column_figure, partial(_draw_all_shares, rows, settings, styles)),
                 )
 
 
@@ -163,7 +163,7 @@ def sweeps_in_columns(summary: pd.DataFrame, metrics: Sequence[str]) -> Iterator
                     yield ColumnFigure(
                         f"{metric}-over-{x}-{panel.title}",
                         f"{_label(metric)} over the {panel.xlabel}: {panel.title}",
-                        panel_in_column(panel),
+                        partial(panel_in_column, panel),
                     )
 
 
@@ -309,6 +309,19 @@ def _draw_bars(
     axes.grid(visible=False, axis="y")
 
 
+def _draw_hatched(
+    rows: pd.DataFrame,
+    attributes: Mapping[str, int],
+    styles: Mapping[str, Style],
+    metric: str,
+    value: Literal["recovered", "mean"],
+    axes: Axes,
+) -> None:
+    _draw_bars(axes, rows, attributes, styles, metric, value, _HATCHES)
+    if value == "recovered":
+        _within_limits(axes.set_xlim, axes.get_xlim())
+
+
 def attributes_in_columns(
     summary: pd.DataFrame, metric: str = "auc", of: str = ""
 ) -> Iterator[ColumnFigure]:
@@ -327,17 +340,13 @@ def attributes_in_columns(
     if value == "recovered":
         what = f"share of the {what} lost that is recovered"
 
-    def draw(axes: Axes, rows: pd.DataFrame) -> None:
-        _draw_bars(axes, rows, attributes, styles, metric, value, _HATCHES)
-        if value == "recovered":
-            _within_limits(axes.set_xlim, axes.get_xlim())
-
     height = 0.5 + len(attributes) * max(0.17, 0.06 * len(styles))
     for title, rows in groups:
+        draw = partial(_draw_hatched, rows, attributes, styles, metric, value)
         yield ColumnFigure(
             f"attributes-{metric}-{of or title}",
             f"By attribute: {what}, with 95 % intervals where they are known; {title}",
-            column_figure(partial(draw, rows=rows), height),
+            partial(column_figure, draw, height),
         )
 
 

@@ -157,14 +157,13 @@ def draw_curves(curves: Sequence[Curve], title: str = "") -> Figure:
     return figure
 
 
-def curves_in_column(curves: Sequence[Curve]) -> tuple[Figure, Figure]:
+def panels_of(curves: Sequence[Curve]) -> tuple[Panel, Panel]:
     """The success plot and the precision plot for a paper, the best first in their legends."""
     by_auc = sorted(curves, key=lambda curve: -curve.auc)
     by_dp20 = sorted(curves, key=lambda curve: -curve.dp20)
     aucs = [f"{curve.label} [{field_score(curve.auc)}]" for curve in by_auc]
     dps = [f"{curve.label} [{field_score(curve.dp20)}]" for curve in by_dp20]
-    success, precision = _panels(by_auc, aucs, aucs)[0], _panels(by_dp20, dps, dps)[1]
-    return panel_in_column(success), panel_in_column(precision)
+    return _panels(by_auc, aucs, aucs)[0], _panels(by_dp20, dps, dps)[1]
 
 
 def _panels(

@@ -15,7 +15,15 @@ from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.evaluation.totals import CurveTotals
 from lae_sim.figures.column import ColumnFigure, column_figure
-from lae_sim.figures.lines import Curve, Line, Panel, curves_in_column, draw_curves, draw_sweep
+from lae_sim.figures.lines import (
+    Curve,
+    Line,
+    Panel,
+    draw_curves,
+    draw_sweep,
+    panel_in_column,
+    panels_of,
+)
 from lae_sim.figures.style import (
     BLUE,
     GREY,
@@ -80,11 +88,17 @@ def curves_for_paper(named: Mapping[str, tuple[Floats, Floats]], of: str) -> Ite
         trace = name.rpartition(": ")[0] if len(named) > MOST_CURVES else ""
         groups.setdefault(trace, {})[name] = curves
     for trace, group in groups.items():
-        success, precision = curves_in_column(_styled_curves(group, of_paper=True))
+        success, precision = panels_of(_styled_curves(group, of_paper=True))
         end, caption = (f"-{trace}", f"{trace}: {of}") if trace else ("", of)
-        yield ColumnFigure(f"success{end}", f"Success: {caption}. In brackets: AUC.", success)
         yield ColumnFigure(
-            f"precision{end}", f"Precision: {caption}. In brackets: precision at 20 px.", precision
+            f"success{end}",
+            f"Success: {caption}. In brackets: AUC.",
+            partial(panel_in_column, success),
+        )
+        yield ColumnFigure(
+            f"precision{end}",
+            f"Precision: {caption}. In brackets: precision at 20 px.",
+            partial(panel_in_column, precision),
         )
 
 
@@ -233,7 +247,7 @@ def timeline_for_paper(run: Run, sigma: Fraction = Fraction(0)) -> ColumnFigure:
         f"timeline-{name}",
         f"{name}: frames as they arrive (hollow: skipped), the tracker at work on them, and the "
         "frame whose output answers the query for each",
-        column_figure(draw, 1.5),
+        partial(column_figure, draw, 1.5),
     )
 
 

@@ -1,12 +1,15 @@
-"""The pictures of a study, as SVG: the same results give the same bytes.
+"""The pictures of a study, for its page and for a paper.
 
 A tracker has one colour and mark throughout, and a forecaster one kind of line, or one colour where
 there are no trackers to tell apart. Pictures that would hold too much choose, and say so.
+
+None is drawn here: each comes with what draws it, which holds no more of the study than it shows
+and can be pickled, so that workers can draw.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
@@ -14,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lae_sim._arrays import Floats
 from lae_sim.comparison.statistics import ALL_TRACES, Interval
 from lae_sim.engine.clock import parse_duration, split_init
 from lae_sim.errors import visible
@@ -23,10 +27,10 @@ from lae_sim.figures.lines import (
     Curve,
     Line,
     Panel,
-    curves_in_column,
     draw_curves,
     draw_sweep,
     panel_in_column,
+    panels_of,
 )
 from lae_sim.figures.style import (
     GREY,
@@ -37,7 +41,6 @@ from lae_sim.figures.style import (
     new_figure,
     panel_grid,
     styled,
-    svg_of,
     tracker_styles,
 )
 from lae_sim.figures.times import draw_times
@@ -54,6 +57,10 @@ if TYPE_CHECKING:
 MOST_CURVES, MOST_PAIRS, MOST_BARS, MOST_HISTOGRAMS, MOST_POINTS = 8, 6, 30, 30, 40
 """What one picture holds of curves, rows and histograms, how many pictures of curves and panels of
 datasets there are, and how many points a panel has beside those of the front."""
+EXAMPLES, FEW_HISTOGRAMS = 3, 12
+"""Datasets and histograms that are drawn where there are more than the most: as examples."""
+MOST_NAMED = 12
+"""Trackers of a panel that have a name and a colour, at most, beside those of the front."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +69,11 @@ class Picture:
 
     Attributes:
         caption: what it shows, and what was chosen of more.
-        svg: the file.
+        draw: draws it; None if there is no more than the caption.
     """
 
     caption: str
-    svg: bytes
+    draw: Callable[[], Figure] | None = None
 
 
 def _short(name: object) -> str:
@@ -75,12 +82,12 @@ def _short(name: object) -> str:
     return text if len(text) <= 36 else f"{text[:17]}…{text[-17:]}"
 
 
-def _styles(view: View) -> dict[tuple[str, str], Style]:
+def _styles(view: View, runs: Iterable[str]) -> dict[tuple[str, str], Style]:
     """Colour and mark of the tracker, line of the forecaster, by run and forecaster."""
     trackers, lines = tracker_styles(view.names.values()), forecaster_lines(view.forecasters)
     return {
-        (run, forecaster): {**trackers[name], "linestyle": line}
-        for run, name in view.names.items()
+        (run, forecaster): {**trackers[view.names[run]], "linestyle": line}
+        for run in runs
         for forecaster, line in lines.items()
     }
 
@@ -100,23 +107,38 @@ def _best_runs(view: View, rows: Sequence[SummaryRow]) -> tuple[list[str], str]:
     return kept, left_out
 
 
+def _datasets(view: View) -> list[str]:
+    """Those that are drawn: all, or the first few where they are examples of many."""
+    every = list(dict.fromkeys(row.dataset for row in view.standing))
+    return every if len(every) <= MOST_PAIRS else every[:EXAMPLES]
+
+
+def _of_datasets(view: View) -> str:
+    """Which datasets are drawn, in words, if not all are."""
+    count, drawn = len({row.dataset for row in view.standing}), len(_datasets(view))
+    return f"; the first {drawn} of {count} datasets" if drawn < count else ""
+
+
 def curves(view: View) -> Iterator[Picture]:
     """Success and precision of each dataset, at the settings that stand for all, then others."""
-    groups = _curve_groups(view)
-    for scores, left_out in groups[:MOST_PAIRS]:
+    groups, count = _curve_groups(view)
+    for scores, left_out in groups:
         rows = [view.row_of(each) for each in scores]
         yield Picture(
             f"{visible(rows[0].dataset)}: {_recorded(rows)}{left_out}. In brackets: AUC, "
             "and precision at 20 px.",
-            svg_of(draw_curves([curve for each in scores for curve in _curves(view, each)])),
+            partial(draw_curves, [curve for each in scores for curve in _curves(view, each)]),
         )
-    if len(groups) > MOST_PAIRS:
-        left = len(groups) - MOST_PAIRS
-        yield Picture(f"{left} more settings are in the ranking, and not drawn here.", b"")
+    if left := count - len(groups):
+        yield Picture(f"{left} more settings are in the ranking, and not drawn here.")
 
 
-def _curve_groups(view: View) -> list[tuple[list[Scores], str]]:
-    """Scores whose curves are drawn together, and what was left out; what stands for all first."""
+def _curve_groups(view: View) -> tuple[list[tuple[list[Scores], str]], int]:
+    """Scores whose curves are drawn together, and what was left out of them; of how many groups.
+
+    What stands for all is first.
+    """
+    datasets = _datasets(view)
     groups: dict[tuple[Any, ...], list[Scores]] = {}
     for scores in view.results.scores:
         if scores.about[0]["curves"]["success"] is not None:  # something was scored
@@ -125,10 +147,11 @@ def _curve_groups(view: View) -> list[tuple[list[Scores], str]]:
         groups.values(), key=lambda group: not any(view.stands(view.row_of(s)) for s in group)
     )
     chosen = []
-    for group in ordered:
+    shown = [group for group in ordered if group[0].source.metadata.dataset in datasets]
+    for group in shown[:MOST_PAIRS]:
         kept, left_out = _best_runs(view, [view.row_of(scores) for scores in group])
         chosen.append(([scores for scores in group if scores.setting.run in kept], left_out))
-    return chosen
+    return chosen, len(groups)
 
 
 def _recorded(rows: Sequence[SummaryRow]) -> str:
@@ -139,7 +162,8 @@ def _recorded(rows: Sequence[SummaryRow]) -> str:
 
 def _curves(view: View, scores: Scores) -> Iterator[Curve]:
     """The curve of a forecaster; before that of hold, the offline one."""
-    run, styles, cells = scores.setting.run, _styles(view), scores.about
+    run, cells = scores.setting.run, scores.about
+    styles = _styles(view, [run])
     weights = [cell["repetitions"] for cell in cells]
     names = {"offline": "offline_"} if scores.forecaster == "hold" else {}
     for name, prefix in {**names, scores.forecaster: ""}.items():
@@ -165,7 +189,7 @@ SWEEPS = {
 def sweep(view: View, key: str) -> Picture | None:
     """AUC and DP of each dataset over a key of ``SWEEPS``; None if it has one value only."""
     caption, panels = _sweep(view, key)
-    return Picture(caption, svg_of(draw_sweep(panels, 2, sharex=True))) if panels else None
+    return Picture(caption, partial(draw_sweep, panels, 2, sharex=True)) if panels else None
 
 
 def _sweep(view: View, key: str) -> tuple[str, list[Panel]]:
@@ -181,9 +205,12 @@ def _sweep(view: View, key: str) -> tuple[str, list[Panel]]:
     if len({x for x, _ in points}) < 2:
         return "", []
     caption = f"Over {SWEEPS[key].split(' (')[0]}: {shared_setting(view.standing, but=varied)}"
+    caption += _of_datasets(view)
     panels: list[Panel] = []
-    for dataset in dict.fromkeys(row.dataset for _, row in points):
+    for dataset in _datasets(view):
         within = [(x, row) for x, row in points if row.dataset == dataset]
+        if not within:
+            continue
         kept, left_out = _best_runs(view, [row for _, row in within])
         caption += left_out and f"{left_out} on {_short(dataset)}"
         shown = [(x, row) for x, row in within if run_of(row) in kept]
@@ -220,7 +247,7 @@ def _sweep_panels(
     order = dict.fromkeys((run_of(row), row.forecaster) for _, row in points)
     rows = [row for _, row in points]
     logarithmic = key == "scale" and min(x for x, _ in points) > 0
-    styles = _styles(view)
+    styles = _styles(view, dict.fromkeys(run for run, _ in order))
     for metric, name in (("auc", score_name("AUC", rows)), ("dp20", score_name("DP", rows))):
         drawn = [
             Line(
@@ -239,17 +266,23 @@ def front(view: View) -> Picture | None:
     points = _points(view)
     if not points:
         return None
-    left_out = _left_out(view, points)
-    return Picture(f"{_front_caption(points)}{left_out}", svg_of(_front(view, points)))
+    fronts = _fronts(view, points)
+    caption = f"{_front_caption(points)}{_left_out(view, points)}{_grey(fronts)}"
+    return Picture(caption, partial(_draw_fronts, fronts))
+
+
+def _grey(fronts: Iterable[Front]) -> str:
+    """That some trackers have no name, in words."""
+    some = any(not mark.name for front in fronts for mark in front.marks)
+    return "; grey: others, without their names" if some else ""
 
 
 def _left_out(view: View, points: Sequence[Point]) -> str:
     """What of a study is not drawn as points, in words."""
-    datasets, drawn = ({row.dataset for row in some} for some in
-                       (view.standing, [point.row for point in points]))  # fmt: skip
-    said = f"; the first {len(drawn)} of {len(datasets)} datasets" if drawn < datasets else ""
+    drawn = {point.row.dataset for point in points}
     within = sum(row.dataset in drawn for row in view.standing)
-    return said + (f"; the best of {within:,}, and the fronts" if len(points) < within else "")
+    said = f"; the best of {within:,}, and the fronts" if len(points) < within else ""
+    return _of_datasets(view) + said
 
 
 def _points(view: View) -> list[Point]:
@@ -259,7 +292,7 @@ def _points(view: View) -> list[Point]:
         if row.elapsed_ms is not None and (auc := row.score("auc")) is not None:
             datasets.setdefault(row.dataset, []).append(Point(row, row.elapsed_ms, auc))
     chosen: list[Point] = []
-    for points in [*datasets.values()][:MOST_PAIRS]:
+    for points in (datasets[name] for name in _datasets(view) if name in datasets):
         least = sorted((point.auc for point in points), reverse=True)[:MOST_POINTS][-1]
         chosen += [point for point in points if point.row.pareto or point.auc >= least]
     return chosen
@@ -282,47 +315,116 @@ class Point:
     auc: float
 
 
+@dataclass(frozen=True)
+class Mark:
+    """A point of a front's panel.
+
+    Attributes:
+        run: of its tracker.
+        name: of its tracker, if that is named; others are grey.
+        ms, auc: where it is.
+        forecaster: what answers.
+        style: colour and mark of the tracker.
+        is_best: whether it is on the front.
+    """
+
+    run: str
+    name: str
+    ms: float
+    auc: float
+    forecaster: str
+    style: Style
+    is_best: bool
+
+
+@dataclass(frozen=True)
+class Front:
+    """AUC against time on one dataset.
+
+    Attributes:
+        dataset: its name.
+        ylabel: what the AUC is called.
+        lines: the kind of line that joins the best marks of each forecaster.
+        marks: those of trackers that are named, and of others.
+    """
+
+    dataset: str
+    ylabel: str
+    lines: Mapping[str, Any]
+    marks: Sequence[Mark]
+
+
+def _fronts(view: View, points: Iterable[Point]) -> list[Front]:
+    """What is drawn of each dataset."""
+    datasets: dict[str, list[Point]] = {}
+    for point in points:
+        datasets.setdefault(point.row.dataset, []).append(point)
+    lines = forecaster_lines(view.forecasters)
+    fronts = []
+    for dataset, within in datasets.items():
+        best = sorted(within, key=lambda point: (not point.row.pareto, -point.auc))
+        on_front = {run_of(point.row) for point in within if point.row.pareto}
+        runs = list(dict.fromkeys(run_of(point.row) for point in best))
+        named = runs[: max(len(on_front), MOST_NAMED)]
+        styles = _styles(view, named)
+        marks = [
+            Mark(
+                run,
+                _short(view.names[run]) if run in named else "",
+                point.ms,
+                point.auc,
+                point.row.forecaster,
+                styles.get((run, "hold"), {"color": GREY, "marker": "."}),
+                point.row.pareto,
+            )
+            for point in within
+            for run in [run_of(point.row)]
+        ]
+        ylabel = score_name("AUC", [point.row for point in within])
+        kinds = {name: lines[name] for name in view.forecasters}
+        fronts.append(Front(_short(dataset), ylabel, kinds, marks))
+    return fronts
+
+
 @styled
-def _front(view: View, points: Sequence[Point]) -> Figure:
-    datasets = list(dict.fromkeys(point.row.dataset for point in points))
-    columns = min(len(datasets), 2)
-    figure, panels = panel_grid(len(datasets), columns, 10 / columns, 3.6)
-    for axes, dataset in zip(panels, datasets):
-        within = [point for point in points if point.row.dataset == dataset]
-        _draw_front(axes, view, within)
-        axes.set_title(_short(dataset))
+def _draw_fronts(fronts: Sequence[Front]) -> Figure:
+    columns = min(len(fronts), 2)
+    figure, panels = panel_grid(len(fronts), columns, 10 / columns, 3.6)
+    for axes, each in zip(panels, fronts):
+        draw_front(axes, each)
+        axes.set_title(each.dataset)
     legend_below(figure)
     return figure
 
 
-def _draw_front(axes: Axes, view: View, points: Sequence[Point]) -> None:
-    """The points of one dataset, and the front of each forecaster."""
-    styles, lines = _styles(view), forecaster_lines(view.forecasters)
-    for forecaster in view.forecasters:
-        best = [p for p in points if p.row.forecaster == forecaster and p.row.pareto]
-        best.sort(key=lambda point: point.ms)
-        style = {"color": GREY, "linestyle": lines[forecaster], "zorder": 1}
-        xs, ys = [point.ms for point in best], [point.auc for point in best]
+def draw_front(axes: Axes, front: Front) -> None:
+    """Draw the marks of one dataset, hollow ones of hold, and the front of each forecaster."""
+    for forecaster, line in front.lines.items():
+        of_it = [mark for mark in front.marks if mark.forecaster == forecaster]
+        best = sorted((mark for mark in of_it if mark.is_best), key=lambda mark: mark.ms)
+        style = {"color": GREY, "linestyle": line, "zorder": 1}
+        xs, ys = [mark.ms for mark in best], [mark.auc for mark in best]
         axes.plot(xs, ys, label=f"front, {_short(forecaster)}", **style)
-    for point in points:
-        filled = "full" if point.row.forecaster != "hold" else "none"
-        style = {**styles[run_of(point.row), "hold"], "linestyle": "", "fillstyle": filled}
-        axes.plot(point.ms, point.auc, **{**style, "markersize": 7})
+        shape: Style = {"linestyle": "", "fillstyle": "none" if forecaster == "hold" else "full"}
+        if unnamed := [(mark.ms, mark.auc) for mark in of_it if not mark.name]:
+            axes.plot(*zip(*unnamed), color=GREY, marker="o", markersize=3.5, alpha=0.6, **shape)
+        for mark in of_it:
+            if mark.name:
+                axes.plot(mark.ms, mark.auc, **{**mark.style, **shape, "markersize": 7})
     axes.margins(x=0.2, y=0.1)
-    _name_trackers(axes, view, points)
-    name = score_name("AUC", [point.row for point in points])
-    axes.set(xlabel="mean time of a call (ms)", ylabel=name)
+    _name_trackers(axes, front.marks)
+    axes.set(xlabel="mean time of a call (ms)", ylabel=front.ylabel)
 
 
-def _name_trackers(axes: Axes, view: View, points: Sequence[Point]) -> None:
-    """A label beside each tracker's best point; where there is no room, above and joined to it."""
-    best = {run_of(point.row): point for point in sorted(points, key=lambda point: point.auc)}
+def _name_trackers(axes: Axes, marks: Iterable[Mark]) -> None:
+    """A label beside each tracker's best mark; where there is no room, above and joined to it."""
+    best = {mark.run: mark for mark in sorted(marks, key=lambda mark: mark.auc) if mark.name}
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     inches = axes.bbox.width / axes.figure.dpi
     letter, line = 0.055 * (right - left) / inches, 0.055 * (high - low)
     taken: list[tuple[float, float, float]] = []
-    for run, point in sorted(best.items(), key=lambda each: each[1].auc):  # the worst first
-        name, x, y = _short(view.names[run]), point.ms, point.auc
+    for mark in sorted(best.values(), key=lambda mark: mark.auc):  # the worst first
+        name, x, y = mark.name, mark.ms, mark.auc
         is_left = x > (left + right) / 2
         length = letter * (len(name) + 3)
         start, stop = (x - length, x) if is_left else (x, x + length)
@@ -330,24 +432,27 @@ def _name_trackers(axes: Axes, view: View, points: Sequence[Point]) -> None:
             if begin < stop and start < end and abs(height - y) < line:
                 y = height + line
         taken.append((start, stop, y))
-        if y > point.auc:
-            axes.plot([x, x], [point.auc, y], color=GREY, linewidth=0.5, zorder=1)
+        if y > mark.auc:
+            axes.plot([x, x], [mark.auc, y], color=GREY, linewidth=0.5, zorder=1)
         axes.annotate(
             name,
             (x, y),
-            (-8 if is_left else 8, 0) if y == point.auc else (-2 if is_left else 2, 0),
+            (-8 if is_left else 8, 0) if y == mark.auc else (-2 if is_left else 2, 0),
             textcoords="offset points",
             ha="right" if is_left else "left",
             va="center",
             fontsize=8,
         )
-    axes.set_ylim(low, max(high, *(y + line for *_, y in taken)))
+    axes.set_ylim(low, max([high, *(y + line for *_, y in taken)]))
 
 
 def gains(view: View) -> Picture | None:
     """What each forecaster wins over hold for each tracker; None if there is only hold."""
     caption, rows, runs = _gaining(view)
-    return Picture(caption, svg_of(_gains(view, rows, runs))) if runs else None
+    if not runs:
+        return None
+    both = _won(view, rows, runs), _recovered(view, rows, runs)
+    return Picture(caption, partial(_draw_both_gains, both))
 
 
 def _gaining(view: View) -> tuple[str, list[SummaryRow], list[str]]:
@@ -365,84 +470,101 @@ def _gaining(view: View) -> tuple[str, list[SummaryRow], list[str]]:
     return f"{caption}: {shared_setting(rows)}", rows, kept
 
 
-@styled
-def _gains(view: View, rows: Sequence[SummaryRow], runs: Sequence[str]) -> Figure:
-    rivals = len(view.forecasters) - 1
-    figure = new_figure(10, 1.3 + 0.3 * len(runs) + 0.1 * len(runs) * rivals)
-    panels = figure.subplots(1, 2, sharey=True)
-    for axes, draw in zip(panels, (_draw_won, _draw_recovered)):
-        draw(axes, view, rows, runs)
-    legend_below(figure)
-    return figure
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """What forecasters gain for each tracker.
+
+    Attributes:
+        xlabel: what it is.
+        names: of the trackers, one below the other.
+        styles: of the forecasters.
+        values: by forecaster, the number of the tracker, the gain and the ends of its interval,
+            NaN where that is not known, float64 [n, 4].
+        limits: beyond which nothing is shown.
+    """
+
+    xlabel: str
+    names: Sequence[str]
+    styles: Mapping[str, Style]
+    values: Mapping[str, Floats]
+    limits: tuple[float, float] = (-np.inf, np.inf)
 
 
 Gain = Callable[[Uncertainty], tuple[float, Interval | None] | None]
 """What a row gains, and its interval; None where it is not known."""
 
 
-def _draw_won(axes: Axes, view: View, rows: Sequence[SummaryRow], runs: Sequence[str]) -> None:
+def _won(view: View, rows: Sequence[SummaryRow], runs: Sequence[str]) -> Gains:
     """The score won over hold."""
 
     def won(uncertainty: Uncertainty) -> tuple[float, Interval | None] | None:
         gain = uncertainty.vs_hold
         return None if gain is None else (gain.value, gain.interval)
 
-    _draw_gains(axes, view, rows, runs, won)
-    axes.set_xlabel(f"{score_name('AUC', rows)} won over hold")
+    return _gained(view, rows, runs, f"{score_name('AUC', rows)} won over hold", won)
 
 
-def _draw_recovered(
-    axes: Axes, view: View, rows: Sequence[SummaryRow], runs: Sequence[str]
-) -> None:
+def _recovered(view: View, rows: Sequence[SummaryRow], runs: Sequence[str]) -> Gains:
     """The share of the loss won back."""
 
     def share(uncertainty: Uncertainty) -> tuple[float, Interval | None] | None:
         gain = uncertainty.recovered
         return None if gain is None or gain.share is None else (gain.share, gain.interval)
 
-    _draw_gains(axes, view, rows, runs, share, 100)
-    axes.set_xlabel("latency loss recovered (%)")
-    low, high = axes.get_xlim()
-    axes.set_xlim(max(low, -100), min(high, 150))  # where little was lost, intervals are wide
+    found = _gained(view, rows, runs, "latency loss recovered (%)", share, 100)
+    return replace(found, limits=(-100, 150))  # where little was lost, intervals are wide
 
 
-def _draw_gains(
-    axes: Axes,
+def _gained(
     view: View,
     rows: Sequence[SummaryRow],
     runs: Sequence[str],
+    xlabel: str,
     gain: Gain,
     factor: float = 1,
-) -> None:
-    rivals = [name for name in view.forecasters if name != "hold"]
-    styles = forecaster_styles(view.forecasters)
+) -> Gains:
     datasets = {run_of(row): _short(row.dataset) for row in rows}
     several = len(set(datasets.values())) > 1
+    names = [_short(view.names[r]) + (f" ({datasets[r]})" if several else "") for r in runs]
+    styles = forecaster_styles(view.forecasters)
+    del styles["hold"]
+    places = {run: place for place, run in enumerate(runs)}
+    values: dict[str, list[tuple[float, ...]]] = {name: [] for name in styles}
+    for row in rows:
+        uncertainty = row.certainty("auc") if row.forecaster in styles else None
+        if uncertainty is not None and (found := gain(uncertainty)) is not None:
+            value, interval = found
+            ends = (np.nan, np.nan) if interval is None else (interval.low, interval.high)
+            scaled = [factor * each for each in (value, *ends)]
+            values[row.forecaster].append((places[run_of(row)], *scaled))
+    arrays = {name: np.array(some, np.float64).reshape(-1, 4) for name, some in values.items()}
+    return Gains(xlabel, names, styles, arrays)
+
+
+@styled
+def _draw_both_gains(both: Sequence[Gains]) -> Figure:
+    count, rivals = len(both[0].names), len(both[0].styles)
+    figure = new_figure(10, 1.3 + 0.3 * count + 0.1 * count * rivals)
+    for axes, each in zip(figure.subplots(1, 2, sharey=True), both):
+        draw_gains(axes, each)
+    legend_below(figure)
+    return figure
+
+
+def draw_gains(axes: Axes, gains: Gains) -> None:
+    """Draw a dot for each gain, and a line for its interval."""
     axes.axvline(0, color=GREY, linewidth=0.8)
-    for forecaster in rivals:
-        style = {**styles[forecaster], "linestyle": "", "label": _short(forecaster)}
-        aside = 0.7 * ((rivals.index(forecaster) + 0.5) / len(rivals) - 0.5)
-        for row in rows:
-            uncertainty = row.certainty("auc") if row.forecaster == forecaster else None
-            found = None if uncertainty is None else gain(uncertainty)
-            if found is not None:
-                value, interval = found
-                _dot(axes, runs.index(run_of(row)) + aside, value, interval, style, factor)
-    axes.set_ylim(len(runs) - 0.5, -0.5)
-    axes.set_yticks(
-        range(len(runs)),
-        [_short(view.names[r]) + (f" ({datasets[r]})" if several else "") for r in runs],
-    )
-
-
-def _dot(
-    axes: Axes, y: float, x: float, interval: Interval | None, style: Style, factor: float = 1
-) -> None:
-    """A value and its interval."""
-    if interval is not None:
-        ends = factor * interval.low, factor * interval.high
-        axes.plot(ends, (y, y), color=style["color"])
-    axes.plot(factor * x, y, **style)
+    count = len(gains.styles)
+    for number, (name, style) in enumerate(gains.styles.items()):
+        places, values, low, high = gains.values[name].T
+        heights = places + 0.7 * ((number + 0.5) / count - 0.5)
+        axes.hlines(heights, low, high, color=style["color"])
+        axes.plot(values, heights, **{**style, "linestyle": "", "label": _short(name)})
+    axes.set_ylim(len(gains.names) - 0.5, -0.5)
+    axes.set_yticks(range(len(gains.names)), gains.names)
+    axes.set_xlabel(gains.xlabel)
+    low, high = axes.get_xlim()
+    axes.set_xlim(max(low, gains.limits[0]), min(high, gains.limits[1]))
 
 
 def attributes(view: View) -> Iterator[Picture]:
@@ -453,7 +575,7 @@ def attributes(view: View) -> Iterator[Picture]:
         yield Picture(
             f"{dataset}: {what} on the sequences of each attribute (n of them), with 95 % "
             "intervals where they are known; at the first sigma",
-            svg_of(attribute_bars(rows, "auc", "recovered" if is_recovered else "mean")),
+            partial(attribute_bars, rows, "auc", "recovered" if is_recovered else "mean"),
         )
 
 
@@ -470,7 +592,7 @@ def histograms(view: View) -> Picture | None:
     traces = [trace for trace in view.results.traces if trace["times"]["histogram"]]
     if not traces:
         return None
-    shown = traces[:MOST_HISTOGRAMS]
+    shown = traces if len(traces) <= MOST_HISTOGRAMS else traces[:FEW_HISTOGRAMS]
     left_out = ""
     if len(shown) < len(traces):
         left_out = f"; the first {len(shown)} of {len(traces)} traces"
@@ -478,55 +600,63 @@ def histograms(view: View) -> Picture | None:
         "Times of the calls: the area of a bar is its share of the calls; dashed: the interval "
         f"between frames; marks: stalls{left_out}"
     )
-    return Picture(caption, svg_of(_histograms(shown)))
+    return Picture(
+        caption, partial(_histograms, [(_short(each["trace"]), each["times"]) for each in shown])
+    )
 
 
 @styled
-def _histograms(traces: Sequence[Mapping[str, Any]]) -> Figure:
+def _histograms(traces: Sequence[tuple[str, Mapping[str, Any]]]) -> Figure:
     figure, panels = panel_grid(len(traces), 3, 10 / 3, 2.1)
-    for axes, trace in zip(panels, traces):
-        draw_times(axes, trace["times"])
-        axes.set_title(_short(trace["trace"]), fontsize=8)
+    for axes, (name, times) in zip(panels, traces):
+        draw_times(axes, times)
+        axes.set_title(name, fontsize=8)
     return figure
 
 
 def study_in_columns(view: View) -> Iterator[ColumnFigure]:
     """The figures of a study for a paper, at the settings that stand for all."""
-    for scores, left_out in _curve_groups(view)[:MOST_PAIRS]:
+    for scores, left_out in _curve_groups(view)[0]:
         rows = [view.row_of(each) for each in scores]
         if not any(map(view.stands, rows)):
             break
         caption = f"on {visible(rows[0].dataset)}: {_recorded(rows)}{left_out}"
         curves = [curve for each in scores for curve in _curves(view, each)]
-        success, precision = curves_in_column(curves)
+        success, precision = panels_of(curves)
         name = rows[0].dataset
-        yield ColumnFigure(f"success-{name}", f"Success {caption}. In brackets: AUC.", success)
+        yield ColumnFigure(
+            f"success-{name}",
+            f"Success {caption}. In brackets: AUC.",
+            partial(panel_in_column, success),
+        )
         yield ColumnFigure(
             f"precision-{name}",
             f"Precision {caption}. In brackets: precision at 20 px.",
-            precision,
+            partial(panel_in_column, precision),
         )
     for key in SWEEPS:
         caption, panels = _sweep(view, key)
         for panel in panels:
             name = f"{panel.ylabel.lower()}-over-{key}-{panel.title}"
-            figure = panel_in_column(panel)
-            yield ColumnFigure(name, f"{panel.ylabel} on {panel.title}. {caption}", figure)
+            said = f"{panel.ylabel} on {panel.title}. {caption}"
+            yield ColumnFigure(name, said, partial(panel_in_column, panel))
     points = _points(view)
     for dataset in dict.fromkeys(point.row.dataset for point in points):
         within = [point for point in points if point.row.dataset == dataset]
+        [drawn] = _fronts(view, within)
         yield ColumnFigure(
             f"front-{dataset}",
-            f"{visible(dataset)}: {_front_caption(within)}",
-            column_figure(partial(_draw_front, view=view, points=within), 2.4),
+            f"{visible(dataset)}: {_front_caption(within)}{_grey([drawn])}",
+            partial(column_figure, partial(draw_front, front=drawn), 2.4),
         )
     caption, rows, runs = _gaining(view)
     height = 0.5 + len(runs) * (0.13 + 0.06 * (len(view.forecasters) - 1))
     if runs:
-        won = column_figure(partial(_draw_won, view=view, rows=rows, runs=runs), height)
-        yield ColumnFigure("won", caption, won)
-        share = column_figure(partial(_draw_recovered, view=view, rows=rows, runs=runs), height)
-        yield ColumnFigure("recovered", f"Share of the loss won back. {caption}", share)
+        won = partial(draw_gains, gains=_won(view, rows, runs))
+        yield ColumnFigure("won", caption, partial(column_figure, won, height))
+        share = partial(draw_gains, gains=_recovered(view, rows, runs))
+        said = f"Share of the loss won back. {caption}"
+        yield ColumnFigure("recovered", said, partial(column_figure, share, height))
     for dataset, group in _attribute_rows(view):
         yield from attributes_in_columns(group, "auc", dataset)
     several = view.results.traces[: MOST_HISTOGRAMS + 1]
@@ -536,5 +666,5 @@ def study_in_columns(view: View) -> Iterator[ColumnFigure]:
                 f"times-{trace['trace']}",
                 f"Times of the calls of {visible(trace['trace'])}: the area of a bar is its share "
                 "of the calls; dashed: the interval between frames; marks: stalls",
-                column_figure(partial(draw_times, times=trace["times"]), 1.6),
+                partial(column_figure, partial(draw_times, times=trace["times"]), 1.6),
             )

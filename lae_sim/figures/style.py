@@ -217,12 +217,22 @@ def save(figure: Figure, path: str) -> None:
         figure.savefig(temporary, format=Path(path).suffix[1:].lower(), dpi=150)
 
 
+def laid_out(figure: Figure) -> None:
+    """Find the places of what is in a figure, once: to save it would find them twice a file."""
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+    figure.set_layout_engine("none")
+
+
 def svg_of(figure: Figure) -> bytes:
     """A figure as SVG, with its text as text; the same figure gives the same bytes."""
     import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     file = io.BytesIO()
     settings: dict[Any, Any] = {"svg.hashsalt": "lae_sim", "svg.fonttype": "none"}
     with matplotlib.rc_context(settings), any_names(figure):
-        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+        laid_out(figure)
+        canvas: Any = FigureCanvasSVG(figure)
+        canvas.print_svg(file, metadata=dict.fromkeys(("Date", "Creator")))
     return file.getvalue()

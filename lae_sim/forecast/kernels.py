@@ -16,7 +16,8 @@ def overlap(a: Any, b: Any) -> float:
     shared = np.maximum(np.minimum(a[0] + a[2], b[0] + b[2]) - np.maximum(a[0], b[0]), 0.0)
     shared *= np.maximum(np.minimum(a[1] + a[3], b[1] + b[3]) - np.maximum(a[1], b[1]), 0.0)
     union = a[2] * a[3] + b[2] * b[3] - shared
-    return min(max(shared / union, 0.0), 1.0) if union > 0 else 0.0
+    ratio = shared / union if union > 0 else 0.0
+    return float(np.minimum(np.maximum(ratio, 0.0), 1.0))
 
 
 @kernel

@@ -59,8 +59,8 @@ from lae_sim.profile.translation import Translated
 from lae_sim.profile.worker import InProcess, Worker
 from lae_sim.progress import ProgressBar, ShowProgress, tell
 from lae_sim.replay.latency import time_label
+from lae_sim.replay.names import flag, named, parse_policy, several, text
 from lae_sim.replay.strides import phases
-from lae_sim.replay.world import flag, named, parse_policy, several, text
 from lae_sim.trace.file import check_replaces, read_trace
 from lae_sim.trace.metadata import text_fault
 
@@ -88,7 +88,7 @@ class ProfilePlan:
             :func:`lae_sim.datasets.layouts.find_dataset`).
         mode: ``"every-frame"``, or ``"real-time"`` to skip frames while the tracker is busy; by
             default real-time with a ``policy`` or a ``timing``, otherwise every frame.
-        policy: which frame a free tracker takes (see :func:`lae_sim.replay.world.parse_policy`);
+        policy: which frame a free tracker takes (see :func:`lae_sim.replay.names.parse_policy`);
             latest if None. Real-time only.
         pre_forecaster: name of the forecaster that sets the search region before each frame.
         pre_forecaster_cost: what it adds to a frame's time, ns; None to measure it.

@@ -10,17 +10,17 @@ from .latency import (
     resampled,
     scaled,
 )
+from .names import parse_latency, parse_policy
+from .pipeline import parse_pipeline, parse_time, read_pipeline
 from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
 from .recorded import AsRecorded
-from .run import Run, Runs, replay_repeated, replay_sequence
+from .run import Repetitions, Run, RunBatch, Runs, replay_repeated, replay_sequence
 from .search import Outcomes, SearchModel, find_search
 from .strides import followed, phases
 from .world import (
     SIGMA_GRID,
     TraceLike,
     World,
-    parse_latency,
-    parse_policy,
     parse_sigmas,
     replay_trace,
 )
@@ -33,8 +33,10 @@ __all__ = [
     "OwnJump",
     "RandomSource",
     "Reach",
+    "Repetitions",
     "Restart",
     "Run",
+    "RunBatch",
     "Runs",
     "SearchModel",
     "TraceLike",
@@ -50,9 +52,12 @@ __all__ = [
     "lognormal",
     "own_jumps",
     "parse_latency",
+    "parse_pipeline",
     "parse_policy",
     "parse_sigmas",
+    "parse_time",
     "phases",
+    "read_pipeline",
     "replay_repeated",
     "replay_sequence",
     "replay_trace",

@@ -168,9 +168,8 @@ class RandomSource:
     def repeated(self, recording: Recording, first: int, count: int) -> Ints:
         """The times of all possible calls in some repetitions, ns, int64 [count, T]."""
         recorded, length = _recorded(recording), len(recording)
-        digest = hashlib.sha256(f"{self.seed}\0{recording.name}".encode()).digest()
-        stream: Any = np.random.PCG64(int.from_bytes(digest, "big"))
-        words = stream.advance(first * length).random_raw(count * length).reshape(count, length)
+        words = stream(self.seed, recording.name, first * length, count * length)
+        words = words.reshape(count, length)
         times = np.empty((count, length), np.int64)
         times[:, 0] = recorded[0]
         times[:, 1:] = self.draw(recorded[1:] if len(recorded) > 1 else recorded, words[:, :-1])
@@ -179,6 +178,59 @@ class RandomSource:
         if self.init_ns is not None:
             times[:, 0] = self.init_ns
         return times
+
+
+def stream(seed: int, name: str, begin: int, count: int) -> Words:
+    """Some words of the random stream of a seed and a sequence, uint64 [count].
+
+    Args:
+        seed: any whole number.
+        name: of the sequence.
+        begin: how many words of the stream come before them.
+        count: how many they are.
+    """
+    digest = hashlib.sha256(f"{seed}\0{name}".encode()).digest()
+    words: Any = np.random.PCG64(int.from_bytes(digest, "big"))
+    drawn: Words = words.advance(begin).random_raw(count)
+    return drawn
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Draws every call's time, the initialisation's too, evenly from a range of whole ns.
+
+    Attributes:
+        low_ns, high_ns: the least and the greatest.
+        seed: of the streams.
+        repetition: see :class:`RandomSource`.
+
+    Raises:
+        LaeError: if the range is empty, or wider than 2**32 ns.
+    """
+
+    low_ns: int
+    high_ns: int
+    seed: int
+    repetition: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.high_ns - self.low_ns < 2**32:
+            raise LaeError(
+                f"a range of times goes from the lower to the higher, at most 4.2 s apart, not "
+                f"from {time_label(self.low_ns)} to {time_label(self.high_ns)}"
+            )
+
+    @property
+    def label(self) -> str:
+        """The name of the source in tables."""
+        return f"uniform:{time_label(self.low_ns)}-{time_label(self.high_ns)}:{self.seed}"
+
+    def __call__(self, recording: Recording) -> Times:
+        """The times of this repetition."""
+        length = len(recording)
+        words = stream(self.seed, recording.name, self.repetition * length, length)
+        drawn = self.low_ns + _below(self.high_ns - self.low_ns + 1, words)
+        return Times(recording.name, drawn, by_call=True)
 
 
 def resampled(seed: int, repetition: int = 0) -> RandomSource:

@@ -6,32 +6,42 @@ Command lines, study files and keyword arguments all make worlds, through the pa
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
 from lae_sim.engine import policies
-from lae_sim.engine.clock import Clock, Number, exact, parse_fps, split_init, whole
+from lae_sim.engine.clock import Clock, Number, exact, parse_fps
+from lae_sim.engine.pipeline import Pipeline
 from lae_sim.engine.scheduler import Policy, scores_latency
-from lae_sim.errors import LaeError, hint, shown
+from lae_sim.errors import LaeError, shown
 from lae_sim.files import sequence_names
 from lae_sim.forecast.base import AnyFactory
-from lae_sim.plugins import bound, imported, with_options
 from lae_sim.replay import latency as sources
 from lae_sim.replay.latency import (
     Constant,
     Initialised,
     LatencySource,
     RandomSource,
-    initialised,
     scaled,
-    time_label,
+)
+from lae_sim.replay.names import (
+    LATENCIES,
+    POLICIES,
+    Plugin,
+    flag,
+    kind_of,
+    label_of,
+    named,
+    parse_latency,
+    parse_policy,
+    several,
+    text,
 )
 from lae_sim.replay.passes import split_passes
-from lae_sim.replay.recorded import RECORDED_POLICY, AsRecorded
+from lae_sim.replay.pipeline import PipelineTimes, parse_time, read_pipeline
 from lae_sim.replay.run import Runs
 from lae_sim.replay.search import find_search, parse_search
 from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
@@ -54,25 +64,9 @@ TraceLike: TypeAlias = "str | os.PathLike[str] | Trace"
 
 Value = TypeVar("Value")
 
-_POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime", "recorded")
-_LATENCIES = ("recorded", "by-call", "stage", "constant", "resample", "lognormal", "bootstrap")
-
 _TRACES_OWN = (RandomSource, sources.StageTimes)  # sources whose initialisations are the trace's
 _TRACE = (str, os.PathLike, Trace)
 _A_TRACE = "a path, a URL or what read_trace gives"
-
-
-@dataclass(frozen=True)
-class Plugin:
-    """A user's own policy or source of times, made once, under the name that asks for it.
-
-    Attributes:
-        label: ``package.module:object``.
-        made: what that is, or an instance of it if it is a class.
-    """
-
-    label: str
-    made: Any = field(compare=False)
 
 
 _PLUGIN: tuple[Any, ...] = (str, Plugin, Callable)
@@ -86,8 +80,10 @@ class World:
         fps: frames that the world shows per second; each trace's own if None.
         forget_arrivals: let frames arrive evenly also where a trace says when each of them arrived,
             which is needed for another rate.
-        policy: which frame a free tracker takes: a name (see :func:`parse_policy`), or a policy.
-        latency: where processing times come from: a name (see :func:`parse_latency`), or a source.
+        policy: which frame a free tracker takes: a policy, or a name of one (see
+            :func:`.names.parse_policy`).
+        latency: where processing times come from: a source, or a name of one (see
+            :func:`.names.parse_latency`).
         scale: exact factor on all times.
         timing: another device's trace of the same sequences, to take the times from.
         passes: traces of the same tracker at other strides, one of which each sequence's boxes
@@ -101,6 +97,8 @@ class World:
         convention: how frames and thresholds count, by name.
         forecasters: names.
         costs: what forecasting costs, such as ``"2ms"`` or ``"kalman=2ms"``.
+        pipeline: stages around the tracker, whose queues say which frames it takes, rather than a
+            policy; the latency is the tracker's, unless that stage has times of its own.
 
     Raises:
         LaeError: if a value is impossible, or some do not go together.
@@ -129,6 +127,7 @@ class World:
     forecasters: tuple[str, ...] = ("hold",)
     costs: tuple[str, ...] = ()
     forget_arrivals: bool = False
+    pipeline: Pipeline | None = None
 
     def __post_init__(self) -> None:
         for name in ("passes", "sigmas", "forecasters", "costs"):
@@ -165,6 +164,8 @@ class World:
         numbers: tuple[object, ...] = (self.scale, *self.sigmas)
         if not all(isinstance(n, (Fraction, int)) and not isinstance(n, bool) for n in numbers):
             raise LaeError("scale and sigmas of a World are exact; World.of takes text too")
+        if self.pipeline is not None:
+            object.__setattr__(self, "latency", self._tracker_latency(self.pipeline))
         scaled(self.source(), self.scale)
         check_sigmas(self.sigmas)
         if not scores_latency(self.rule()):
@@ -173,6 +174,29 @@ class World:
                     raise LaeError(
                         f"{label_of(self.policy)} never scores latency: it goes with no {what}"
                     )
+
+    def _tracker_latency(self, pipeline: Pipeline) -> str | LatencySource | Plugin:
+        """The world's latency, which is that of the pipeline's tracker if this has one."""
+        if not isinstance(pipeline, Pipeline):
+            raise LaeError(f"pipeline: a Pipeline, or the path of its file, not {shown(pipeline)}")
+        if self.rule() is not policies.latest:
+            raise LaeError(
+                f"policy: {label_of(self.policy)} does not go with a pipeline, whose queues say "
+                "which frames are taken"
+            )
+        PipelineTimes.of(pipeline)
+        time = next(each.time for each in pipeline.stages if each.name == pipeline.tracker)
+        if time is None:
+            return self.latency
+        own: str | LatencySource = time
+        if isinstance(time, str) and hasattr(source := parse_time(time), "label"):
+            own = source
+        if self.latency not in ("recorded", own):
+            raise LaeError(
+                f"latency: {label_of(self.latency)}, and the pipeline says {label_of(own)}: leave "
+                f"out the time of its stage {pipeline.tracker!r}"
+            )
+        return own
 
     @classmethod
     def of(
@@ -192,6 +216,7 @@ class World:
         forecasters: str | Iterable[str] = ("hold",),
         costs: str | Iterable[str] = (),
         forget_arrivals: bool = False,
+        pipeline: Pipeline | str | os.PathLike[str] | None = None,
     ) -> World:
         """A world from text and plain numbers, as command lines and files have them.
 
@@ -203,8 +228,8 @@ class World:
         """
         return cls(
             fps=None if fps is None else named("fps", parse_fps, fps),
-            policy=_made("policy", policy, parse_policy, _POLICIES),
-            latency=_made("latency", latency, parse_latency, _LATENCIES),
+            policy=_made("policy", policy, parse_policy, POLICIES),
+            latency=_made("latency", latency, parse_latency, LATENCIES),
             scale=named("scale", _factor, scale),
             timing=timing,
             passes=several(passes),
@@ -216,6 +241,7 @@ class World:
             forecasters=tuple(dict.fromkeys(several(forecasters))),
             costs=several(costs),
             forget_arrivals=forget_arrivals,
+            pipeline=_pipeline(pipeline),
         )
 
     @classmethod
@@ -223,12 +249,13 @@ class World:
         cls,
         *,
         policy: Any = "latest",
+        pipeline: Any = None,
         fps: Any = None,
         latency: Any = "recorded",
         scale: Any = 1,
         **others: Any,
     ) -> tuple[World, ...]:
-        """The worlds of every combination of some policies, rates, latencies and scales.
+        """The worlds of all combinations of some policies, pipelines, rates, latencies and scales.
 
         Each is one value or several; the last varies fastest. ``others`` are as in :meth:`of`. A
         plug-in that is named is made once, and shared by the worlds.
@@ -236,12 +263,13 @@ class World:
         Raises:
             LaeError: as :meth:`of`, or if there is nothing of one, or two have the same name.
         """
-        rules = [_made("policy", each, parse_policy, _POLICIES) for each in several(policy)]
-        times = [_made("latency", each, parse_latency, _LATENCIES) for each in several(latency)]
+        rules = [_made("policy", each, parse_policy, POLICIES) for each in several(policy)]
+        times = [_made("latency", each, parse_latency, LATENCIES) for each in several(latency)]
         rates = [named("fps", parse_fps, each) for each in several(fps)]
         factors = [named("scale", _factor, each) for each in several(scale)]
         swept: dict[str, list[Any]] = {
             "policy": _distinct("policy", rules),
+            "pipeline": [None] if pipeline is None else _pipelines(several(pipeline)),
             "fps": [None] if fps is None else list(dict.fromkeys(rates)),
             "latency": _distinct("latency", times),
             "scale": list(dict.fromkeys(factors)),
@@ -266,6 +294,11 @@ class World:
         if isinstance(self.latency, Plugin):
             return self.latency.made  # type: ignore[no-any-return]
         return parse_latency(self.latency) if isinstance(self.latency, str) else self.latency
+
+    @property
+    def policy_label(self) -> str:
+        """What says which frames are taken: the policy, or ``"pipeline:NAME"``."""
+        return label_of(self.policy) if self.pipeline is None else f"pipeline:{self.pipeline.name}"
 
     def label(self) -> str:
         """The latency and its scale, such as ``"recorded x 2"``."""
@@ -329,6 +362,7 @@ class World:
             (*(each if names is None else each.chosen(names) for each in strided), *gaps),
             find_search(self.search, opened.metadata, gaps, pre_forecaster, self.keep_size),
             self.forget_arrivals,
+            None if self.pipeline is None else PipelineTimes.of(self.pipeline, self.scale),
         )
 
 
@@ -343,12 +377,14 @@ def replay_trace(
     passes: TraceLike | Iterable[TraceLike] = (),
     search: str = "trace",
     forget_arrivals: bool = False,
+    pipeline: Pipeline | str | os.PathLike[str] | None = None,
 ) -> Runs:
     """Replay every sequence of a trace, one after another.
 
     Args:
         trace: the boxes and the truth: an open trace, or the path or URL of one.
-        fps, policy, latency, scale, timing, passes, search, forget_arrivals: see :meth:`World.of`.
+        fps, policy, latency, scale, timing, passes, search, forget_arrivals, pipeline: see
+            :meth:`World.of`; a pipeline may be the path of its file.
 
     Returns:
         The runs, which are made while one goes through them, and may be gone through again.
@@ -371,6 +407,7 @@ def replay_trace(
         scale=scale,
         search=search,
         forget_arrivals=forget_arrivals,
+        pipeline=pipeline,
         **open_others(timing, passes),
     )
     return world.replay(opened)
@@ -403,84 +440,6 @@ def open_others(
     }
 
 
-def parse_policy(text: str) -> Policy:
-    """A policy by name.
-
-    A user's own is named ``package.module:object``: a policy, or a class that makes one; parameters
-    may follow, as in ``mine:Patient:frames=2``.
-
-    Raises:
-        LaeError: if there is none of that name, or its value does not fit.
-    """
-    name, colon, value = text.partition(":")
-    if text == "latest":
-        return policies.latest
-    if text == "fifo":
-        return policies.fifo
-    if text == RECORDED_POLICY:
-        return AsRecorded()
-    if name == "every":
-        return policies.every(_number(text, value, least=1))
-    if name == "shrinking-tail" and value:
-        return policies.shrinking_tail(value)
-    if name == "vot-realtime":
-        return policies.vot_realtime(*([_number(text, value)] if value else []))
-    if colon and name not in ("latest", "fifo", "shrinking-tail", RECORDED_POLICY):
-        policy: Policy = _plugin("policy", text, _POLICIES, ("clock", "calls"))
-        return policy
-    raise LaeError(
-        f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
-        f"vot-realtime[:GRACE], recorded, package.module:object{hint(name, _POLICIES)}"
-    )
-
-
-def parse_latency(text: str) -> LatencySource:
-    """A latency source by name.
-
-    A user's own is named ``package.module:object``: a source, or a class that makes one; parameters
-    may follow, as in ``mine:Jitter:ms=40,seed=3``. Every name may end in ``,init=TIME``, what the
-    initialisation takes: ``constant:47ms,init=800ms``.
-
-    Raises:
-        LaeError: if there is none of that name, or its value does not fit.
-    """
-    text, init_ns = split_init(text)
-    if init_ns is not None:
-        return initialised(parse_latency(text), init_ns)
-    name, colon, value = text.partition(":")
-    if text == "recorded":
-        return sources.by_frame
-    if text == "by-call":
-        return sources.by_call
-    if name == "stage":
-        return named(f"latency {shown(text)}", _stages, value)
-    if name == "constant":
-        return sources.constant(value)
-    if name == "resample":
-        return sources.resampled(_number(text, value))
-    if name == "lognormal":
-        return sources.lognormal(_number(text, value))
-    if name == "bootstrap":
-        seed, *block = value.split(":", 1)
-        return sources.bootstrap(_number(text, seed), *(_number(text, n, least=1) for n in block))
-    if colon and name not in ("recorded", "by-call"):
-        source: LatencySource = _plugin("latency", text, _LATENCIES, ("recording",))
-        return source
-    meant = hint(name, _LATENCIES)
-    if text[:1].isdigit():
-        unit = "" if text[-1:].isalpha() else "ms"
-        meant = f"; did you mean constant:{text:.40}{unit}?"
-    raise LaeError(
-        f"no latency {shown(text)}: there are recorded, by-call, stage:NAME[+NAME], "
-        "constant:47ms, resample:SEED, lognormal:SEED, bootstrap:SEED[:BLOCK], "
-        f"package.module:object, all of them perhaps with ,init=TIME{meant}"
-    )
-
-
-def _stages(value: str) -> sources.StageTimes:
-    return sources.StageTimes(tuple(value.split("+")))
-
-
 def parse_sigmas(value: Number | Iterable[Number]) -> tuple[Fraction, ...]:
     """Permitted latencies in ascending order: one, several, or ``"grid"``.
 
@@ -504,57 +463,30 @@ def check_sigmas(sigmas: tuple[Fraction, ...]) -> None:
         raise LaeError("sigma: permitted latencies must be ascending, each of them once")
 
 
-def several(value: Any) -> tuple[Any, ...]:
-    """One value, or several, as a tuple; None is none. Text, a trace, a function are one value."""
-    if value is None:
-        return ()
-    one = isinstance(value, (str, bytes, os.PathLike, Trace)) or not isinstance(value, Iterable)
-    return (value,) if one else tuple(value)
-
-
-def text(value: Any) -> str:
-    """Text that is not empty.
-
-    Raises:
-        LaeError: if the value is none.
-    """
-    if not isinstance(value, str) or not value:
-        own = ": name your own as 'package.module:object'" if callable(value) else ""
-        raise LaeError(f"{shown(value)} is not text{own}")
-    return value
-
-
-def flag(value: Any) -> bool:
-    """True or false.
-
-    Raises:
-        LaeError: if the value is neither.
-    """
-    if not isinstance(value, bool):
-        raise LaeError(f"{shown(value)} is neither true nor false")
-    return value
-
-
-def named(name: str, parse: Callable[[Any], Value], value: Any) -> Value:
-    """What a parser makes of an argument's value.
-
-    Raises:
-        LaeError: what the parser raises, with the argument's name.
-    """
-    try:
-        return parse(value)
-    except LaeError as error:
-        if str(error).startswith(f"{name}: "):
-            raise
-        raise type(error)(f"{name}: {error}") from error
-
-
 def _made(name: str, given: Any, parse: Callable[[str], object], known: Iterable[str]) -> Any:
     """A policy or a source of times: a name of ours that has been looked up, or what it is."""
     if not isinstance(given, str):
         return given
     made = named(name, parse, given)
     return given if kind_of(given) in known else Plugin(given, made)
+
+
+def _pipeline(given: Any) -> Pipeline | None:
+    """A pipeline, read if it is the path of a file."""
+    if isinstance(given, (str, os.PathLike)):
+        return named("pipeline", read_pipeline, given)
+    made: Pipeline | None = given
+    return made
+
+
+def _pipelines(given: Iterable[Any]) -> list[Pipeline | None]:
+    """Pipelines, each once, no two of the same name."""
+    found: dict[str, Pipeline | None] = {}
+    for each in map(_pipeline, given):
+        name = getattr(each, "name", "")
+        if found.setdefault(name, each) != each:
+            raise LaeError(f"pipeline: two are called {name!r}: give them names of their own")
+    return list(found.values())
 
 
 def _distinct(name: str, plugins: Iterable[Any]) -> list[Any]:
@@ -574,47 +506,6 @@ def _factor(value: Number) -> Fraction:
     if factor < 0:
         raise LaeError(f"times cannot be scaled by {factor}, below zero")
     return factor
-
-
-def label_of(plugin: object) -> str:
-    """The name of a policy or a source of times in tables."""
-    if isinstance(plugin, str):
-        return plugin
-    if isinstance(plugin, Initialised):
-        return f"{label_of(plugin.source)},init={time_label(plugin.init_ns)}"
-    own = {id(sources.by_frame): "recorded", id(sources.by_call): "by-call"}.get(id(plugin))
-    label = own or getattr(plugin, "label", None) or getattr(plugin, "__name__", None)
-    return str(label or type(plugin).__name__)
-
-
-def kind_of(label: str) -> str:
-    """What kind of policy or source a label names: all before its values, as ``"constant"``."""
-    return re.split("[:,]", label, maxsplit=1)[0]
-
-
-def _plugin(what: str, text: str, known: Iterable[str], arguments: Sequence[str]) -> Any:
-    """What a user made, or an instance of it if it is a class, with options; checked.
-
-    Args:
-        what: what it is.
-        text: its name.
-        known: what else may have been meant.
-        arguments: names of those that it will be called with.
-    """
-    try:
-        made, options = imported(f"{what} {text!r}", text)
-    except LaeError as error:
-        raise LaeError(f"{error}{hint(text.partition(':')[0], known)}") from error
-    if isinstance(made, type):
-        made, options = bound(f"{what} {text!r}", made, [], options), {}
-    return with_options(f"{what} {text!r}", made, options, arguments)
-
-
-def _number(text: str, value: str, least: int = 0) -> int:
-    try:
-        return whole(value, least)
-    except LaeError as error:
-        raise LaeError(f"{text!r} needs a whole number from {least} after the colon") from error
 
 
 def _check_kinds(name: str, values: Iterable[object], kinds: tuple[Any, ...], what: str) -> None:

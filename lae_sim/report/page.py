@@ -11,8 +11,9 @@ import base64
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from lae_sim import __version__
@@ -20,7 +21,7 @@ from lae_sim.errors import listed, visible
 from lae_sim.evaluation.metrics import CONVENTIONS, Convention
 from lae_sim.figures import study as study_figures
 from lae_sim.figures.study import SWEEPS, Picture
-from lae_sim.figures.style import BLUE, VERMILION
+from lae_sim.figures.style import BLUE, VERMILION, svg_of
 from lae_sim.files import written_whole
 from lae_sim.report import study_tables
 from lae_sim.report.closeup import CloseUp, close_ups
@@ -118,6 +119,29 @@ def write_report(
 
 def page(view: View, root: str | os.PathLike[str] | None = None) -> str:
     """The report's HTML (see :func:`write_report`)."""
+    sections = page_sections(view, root)
+    drawn = {name: draw() for name, draw in page_drawings(sections).items()}
+    return page_of(view, sections, drawn)
+
+
+def page_drawings(sections: Iterable[Section]) -> dict[str, Callable[[], str]]:
+    """What draws each picture of some sections, by its name; it can be pickled."""
+    return {
+        f"{section.anchor}-{number}": partial(_drawn, picture, f"{section.anchor}-{number}")
+        for section in sections
+        for number, picture in enumerate(section.pictures, 1)
+        if picture.draw is not None
+    }
+
+
+def _drawn(picture: Picture, name: str) -> str:
+    """A picture as a part of the page; the name sets its identifiers apart."""
+    assert picture.draw is not None
+    return inlined(svg_of(picture.draw()), picture.caption, name)
+
+
+def page_of(view: View, sections: Sequence[Section], drawn: Mapping[str, str]) -> str:
+    """The page of some sections, with what came of their :func:`page_drawings`."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -129,31 +153,29 @@ def page(view: View, root: str | os.PathLike[str] | None = None) -> str:
     )
     environment.filters |= {
         "visible": visible,
-        "inlined": inlined,
         "variable": variable,
         "base64": lambda data: base64.b64encode(data).decode(),
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),
     }
     datasets = dict.fromkeys(visible(row.dataset) for row in view.results.summary)
-    sections = [section for section in _sections(view, root) if not section.is_empty]
     return environment.get_template("page.html").render(
         title=f"Latency-aware study: {', '.join(datasets)}",
         conclusion=view.results.verdict(),
         facts=_facts(view),
         sections=sections,
         style=page_file("page.css"),
-        dark=page_file("dark.css") + _dark_figures(sections),
+        drawn=drawn,
+        dark=page_file("dark.css") + _dark_figures(sections, drawn.values()),
         script=page_file("page.js"),
     )
 
 
-def _dark_figures(sections: Iterable[Section]) -> str:
+def _dark_figures(sections: Iterable[Section], drawn: Iterable[str]) -> str:
     """The rule of CSS that makes the colours of figures those of a dark page."""
-    pictures = (picture.svg.decode() for section in sections for picture in section.pictures)
     colours = (
         " ".join(each.colours.values()) for section in sections for each in section.close_ups
     )
-    variables = {**dark_colours([BLUE, VERMILION]), **dark_colours([*pictures, *colours])}
+    variables = {**dark_colours([BLUE, VERMILION]), **dark_colours([*drawn, *colours])}
     return f":root {{ {'; '.join(f'{name}: {colour}' for name, colour in variables.items())} }}"
 
 
@@ -205,6 +227,11 @@ def _search_facts(results: StudyResults) -> dict[str, str]:
     return {"search model": "; ".join(said), "ranking": "; ".join(results.ranked_by())}
 
 
+def page_sections(view: View, root: str | os.PathLike[str] | None = None) -> list[Section]:
+    """The sections of a study's page that are not empty, their pictures not drawn yet."""
+    return [section for section in _sections(view, root) if not section.is_empty]
+
+
 def _sections(view: View, root: str | os.PathLike[str] | None) -> Iterator[Section]:
     results = view.results
     failures = [f"{failure.of}: {failure.reason}" for failure in results.failures]
@@ -214,11 +241,11 @@ def _sections(view: View, root: str | os.PathLike[str] | None) -> Iterator[Secti
     yield Section("ranking", "Ranking", meanings=meanings, table=ranking)
     yield Section("table2", "With and without forecasters", table=study_tables.table2(view))
     yield Section("curves", "Success and precision", pictures=[*study_figures.curves(view)])
-    sweeps = _drawn(*(study_figures.sweep(view, key) for key in SWEEPS))
+    sweeps = _known(*(study_figures.sweep(view, key) for key in SWEEPS))
     yield Section("sweeps", "Over permitted latency, speed and rate", pictures=sweeps)
-    front = _drawn(study_figures.front(view))
+    front = _known(study_figures.front(view))
     yield Section("front", "Accuracy against time", pictures=front)
-    yield Section("gains", "What forecasters win", pictures=_drawn(study_figures.gains(view)))
+    yield Section("gains", "What forecasters win", pictures=_known(study_figures.gains(view)))
     sequences, texts = close_ups(view, root)
     yield Section("sequences", "Frame by frame", texts=texts, close_ups=sequences)
     if attributes := study_tables.attribute_table(view):
@@ -236,7 +263,7 @@ def _sections(view: View, root: str | os.PathLike[str] | None) -> Iterator[Secti
         required = study_tables.required_table(view).first(MOST_ROWS, "required.csv")
         texts = shortfalls(results.required, view.names)
         yield Section("required", "What the required AUC asks for", texts=texts, table=required)
-    histograms = _drawn(study_figures.histograms(view))
+    histograms = _known(study_figures.histograms(view))
     yield Section(
         "times",
         "Processing times",
@@ -259,7 +286,7 @@ def _sections(view: View, root: str | os.PathLike[str] | None) -> Iterator[Secti
     yield Section("study", "The study", entries=[asked])
 
 
-def _drawn(*pictures: Picture | None) -> list[Picture]:
+def _known(*pictures: Picture | None) -> list[Picture]:
     return [picture for picture in pictures if picture is not None]
 
 

@@ -37,7 +37,7 @@ from lae_sim.report.table import (
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from lae_sim.figures.column import ColumnFigure
+    from lae_sim.figures.column import DrawnFigure
 
 CONTENTS = "contents.json"
 FIGURES, TABLES = "figures", "tables"
@@ -64,13 +64,13 @@ class Paper:
     """What is written for a paper.
 
     Attributes:
-        figures: figures, drawn when they are asked for.
+        figures: figures; of an iterator, drawn when they are asked for.
         tables: tables in all forms.
         frames: tables by name that are CSV and Parquet alone.
         documents: JSON objects by the name of their file.
     """
 
-    figures: Iterable[ColumnFigure] = ()
+    figures: Iterable[DrawnFigure] = ()
     tables: Sequence[PaperTable] = ()
     frames: Mapping[str, DataFrame] = field(default_factory=dict)
     documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -143,8 +143,6 @@ def remove_paper(folder: Path) -> None:
 
 def _staged(paper: Paper, staging: Path) -> dict[str, Any]:
     """Write everything into an empty folder; what ``contents.json`` says of it."""
-    from lae_sim.figures.column import write_column_figure
-
     figures, tables = staging / FIGURES, staging / TABLES
     figures.mkdir()
     tables.mkdir()
@@ -156,7 +154,10 @@ def _staged(paper: Paper, staging: Path) -> dict[str, Any]:
 
     for figure in paper.figures:
         name = _file_name(figure.name, taken)
-        note(name, figure.caption, write_column_figure(figure.figure, figures, name))
+        paths = [figures / f"{name}.{kind}" for kind in figure.files]
+        for path, content in zip(paths, figure.files.values()):
+            path.write_bytes(content)
+        note(name, figure.caption, paths)
     for table in paper.tables:
         note(table.whole.name, table.whole.caption, write_table(table, tables))
     for name, frame in paper.frames.items():

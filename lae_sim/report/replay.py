@@ -259,7 +259,7 @@ def attribute_members(metadata: Metadata, sequences: Iterable[str]) -> dict[str,
     return members
 
 
-SWEPT = {"fps": "fps", "latency_scale": "scale"}
+SWEPT = {"fps": "fps", "latency_scale": "scale", "policy": "pipeline"}
 """What a sweep can vary, by its name in reports, with the heading of its column."""
 
 
@@ -411,6 +411,57 @@ def settings_text(report: Report) -> str:
             "a stateful\n  tracker would have seen larger motion there, so this is optimistic"
         )
     return "\n".join(lines)
+
+
+def pipeline_text(report: Report, width: int | None = None) -> str:
+    """What happened at the stages of a pipeline, and in words what the columns are."""
+    pipeline = report["pipeline"]
+    camera, result = pipeline["camera"], report["results"][0]
+    lines = [
+        f"{pipeline['name']}: the camera lost {camera['lost']:,} of {camera['frames']:,} frames "
+        f"and delivered the others after {_MS(camera['delay_ms'])}",
+        "",
+        text_of_records(_pipeline_columns(pipeline["stages"]), pipeline["stages"], width),
+        "",
+    ]
+    lines += [
+        f"resource {each['resource']}: in use {PERCENT(each['utilisation'])} of the time"
+        for each in pipeline["resources"]
+    ]
+    lines.append(
+        f"{pipeline['outputs']:,} answers, {pipeline['overtaken']:,} of them after a newer one; "
+        f"at sigma {result['sigma']:g} an answer is {_MS(result['age_ms'])} old, from its frame's "
+        f"delivery on, and {_MS(result['capture_age_ms'])} from its capture on"
+    )
+    lines[-1:] = [fill(lines[-1], 100, break_on_hyphens=False)]
+    return "\n".join(lines)
+
+
+def _pipeline_columns(stages: Sequence[Report]) -> list[Column]:
+    """Those of which there is something to say."""
+    rare = ("resource_wait_ms", "blocked_ms")
+    said = [key for key in rare if any(stage[key] for stage in stages)]
+    return [column for column in _PIPELINE if column.value not in rare or column.value in said]
+
+
+def _drops(stage: Report) -> str:
+    return ", ".join(f"{count:,} {why}" for why, count in stage["dropped"].items()) or "-"
+
+
+_MS = Number(".1f", unit=" ms")
+_PIPELINE = [
+    Column("stage", "stage", is_label=True),
+    Column("arrived", "arrived", COUNT, importance=7),
+    Column("done", "done", COUNT, importance=8),
+    Column("dropped", _drops, importance=6),
+    Column("busy", "utilisation", PERCENT, importance=8),
+    Column("waits", "wait_ms", _MS, importance=6),
+    Column("for resource", "resource_wait_ms", _MS, importance=3),
+    Column("works", "work_ms", _MS, importance=7),
+    Column("blocked", "blocked_ms", _MS, importance=3),
+    Column("age in", "age_in_ms", _MS, importance=5),
+    Column("age out", "age_out_ms", _MS, importance=8),
+]
 
 
 def _wrapped(note: str) -> str:

@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
+from lae_sim.comparison.pairs import Member, Pairs, pairs_of
 from lae_sim.comparison.statistics import RESAMPLES, Difference, Interval
 from lae_sim.evaluation.modelled import Ranking
 from lae_sim.files import text_digest, written_whole
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.study.pairs import Member, Pairs, pairs_of
 from lae_sim.study.records import MEAN, Comparison
 from lae_sim.study.summary import Scores, ranked
-from lae_sim.trace.columns import from_numpy, from_texts
+from lae_sim.trace.columns import from_numpy, from_texts, to_numpy
 
 VERSION = 1
 """Of the pairs; those of another version are computed again."""
@@ -193,7 +193,7 @@ class PairsFile:
 
             for each in rivals:
                 if each.key in self.places:
-                    table = self.rows(each.key)
+                    table = self.rows(each.key).cast(_schema())
                 elif (pairs := found(each)) is not None:
                     table = _table(each, pairs)
                 else:
@@ -208,12 +208,14 @@ class PairsFile:
         self.places, self._read = places, None
 
     def rows(self, key: str) -> Any:
-        """The pairs of some rivals, as an Arrow table."""
+        """The pairs of some rivals, as an Arrow table whose texts are in dictionaries."""
         import pyarrow.parquet as pq
 
         place = self.places[key]
         if self._read is None or self._read[0] != place.group:
-            with pq.ParquetFile(os.fspath(self.path)) as file:
+            self._read = None  # or two of them would be held
+            texts = [*_TEXTS, "ranked_by"]
+            with pq.ParquetFile(os.fspath(self.path), read_dictionary=texts) as file:
                 self._read = place.group, file.read_row_group(place.group)
         return self._read[1].slice(place.first, place.count)
 
@@ -225,11 +227,21 @@ class PairsFile:
         for each in rivals:
             if each.key not in self.places:
                 continue
-            table, best = self.rows(each.key), each.best if self.total > MOST else None
-            if best is not None:
-                names = zip(*(table.column(side).to_pylist() for side in "ab"))
-                table = table.take([row for row, pair in enumerate(names) if best in pair])
-            yield from map(_record, table.to_pylist())
+            table = self.rows(each.key)
+            if self.total <= MOST:
+                yield from map(_record, table.to_pylist())
+                continue
+            table, of_best = table.combine_chunks(), np.zeros(table.num_rows, bool)
+            for side in "ab":
+                column = table.column(side).chunk(0)
+                names = np.array(column.dictionary.to_pylist())
+                of_best |= names[to_numpy(column.indices, "int32")] == each.best
+            some = np.flatnonzero(of_best).tolist()
+            chosen = [  # take would import pandas
+                [column.chunk(0)[row].as_py() for row in some] for column in table.columns
+            ]
+            for values in zip(*chosen):
+                yield _record(dict(zip(table.column_names, values)))
 
 
 def _schema() -> Any:

@@ -15,9 +15,10 @@ from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.forecast.costs import resolve_costs
 from lae_sim.learning.folds import Trainer
 from lae_sim.learning.registry import base_name, files_named, load_any, load_forecaster
+from lae_sim.replay.names import named
 from lae_sim.replay.passes import passes_for
 from lae_sim.replay.run import check_rate
-from lae_sim.replay.world import World, named
+from lae_sim.replay.world import World
 from lae_sim.study.cells import Cell, Input, Setting, Task
 from lae_sim.study.spec import Study, is_random
 from lae_sim.trace.file import read_trace

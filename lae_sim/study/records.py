@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
@@ -33,11 +33,11 @@ class Record:
 def _plain(record: Any, until: str = "") -> dict[str, Plain]:
     """The fields of a record, up to one of them; exact numbers as text."""
     row: dict[str, Plain] = {}
-    for each in fields(record):
-        if each.name == until:
+    for name in record.__dataclass_fields__:
+        if name == until:
             break
-        value = getattr(record, each.name)
-        row[each.name] = str(value) if isinstance(value, Fraction) else value
+        value = getattr(record, name)
+        row[name] = str(value) if isinstance(value, Fraction) else value
     return row
 
 

@@ -17,29 +17,40 @@ from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
 from lae_sim._compiled import amount
+from lae_sim.comparison.pairs import Pairs
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.caveats import at_the_floor, floor_notes
-from lae_sim.files import check_distinct, csv_cell, written_whole
+from lae_sim.files import check_distinct, csv_cell, text_digest, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
 from lae_sim.study.cells import Result, Task
 from lae_sim.study.comparisons import PairsFile, Rivals, rivals_of
 from lae_sim.study.deployment import Curve, Search, requirement, searches
 from lae_sim.study.executors import RunAll, at_work, cores, run_here
-from lae_sim.study.pairs import Pairs
 from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import MEAN, Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
-from lae_sim.study.store import Store
+from lae_sim.study.store import Documents, Store
 from lae_sim.study.summary import (
     Scores,
     rankings_of,
     read_scores,
     summarise_study,
 )
+from lae_sim.study.uncertainty import Answers, Resamples
 from lae_sim.study.verdict import verdict
-from lae_sim.study.work import Batch, Description, Done, Work, attempt, attempt_batch, batches
+from lae_sim.study.work import (
+    Batch,
+    Description,
+    Done,
+    Work,
+    attempt,
+    attempt_batch,
+    batches,
+    seconds,
+)
 from lae_sim.trace.describe import is_measured
+from lae_sim.trace.locate import digest
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -48,8 +59,18 @@ if TYPE_CHECKING:
 PAIRS = "comparisons.parquet"
 """The file of all pairs of traces."""
 
+TABLES = "tables"
+"""The document that says what the files of the summary were made of."""
+
+ANSWERS = "answers"
+"""The document of what resampling the scores said (see :class:`.uncertainty.Answers`)."""
+
 FEW = 30_000
 """Pairs, counted twice, that are sooner compared here than handed to workers."""
+
+
+ALONE = 1.0
+"""Seconds of work for which no other process is started: that alone takes half of it."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,7 +117,7 @@ class StudyResults:
     comparisons: tuple[Comparison, ...]
     pairs: int
     required: tuple[Requirement, ...]
-    traces: tuple[dict[str, Any], ...]
+    traces: Sequence[Mapping[str, Any]]
     computed: int
     failures: tuple[Failure, ...]
     training: tuple[str, ...] = ()
@@ -173,10 +194,9 @@ class StudyResults:
     def search_sources(self) -> list[str]:
         """What is known of the reach of the trackers of traces, where something is modelled."""
         return self._of_traces(
-            (scores.setting.trace.label, f"modelled: {about['modelled']['source']}")
+            (scores.setting.trace.label, f"modelled: {source}")
             for scores in self.scores
-            for about in scores.about
-            if about["modelled"]
+            for source in scores.reach_sources
         )
 
     def _of_traces(self, said: Iterable[tuple[str, str]]) -> list[str]:
@@ -207,9 +227,7 @@ class StudyResults:
                 'measure c: lae-sim profile --gaps, then passes = ["TRACE.gaps.parquet"]; or name '
                 'it: search = "c=0.7"; search = "off" leaves the model out'
             )
-        notes += [
-            note for scores in self.scores for about in scores.about for note in about["notes"]
-        ]
+        notes += [note for scores in self.scores for note in scores.notes]
         notes += floor_notes(
             row.trace + (f" x {row.scale}" if row.scale != 1 else "")
             for row in self.summary
@@ -226,6 +244,11 @@ class StudyResults:
 
     def document(self) -> dict[str, Any]:
         """All but the scores of single sequences, as ``study.json`` holds it."""
+        parts = self._document().items()
+        return {key: [*each] if isinstance(each, Iterator) else each for key, each in parts}
+
+    def _document(self) -> dict[str, Any]:
+        """The same, its lists of what may be many as they are gone through."""
         return {
             "format": "lae-study",
             "version": "1.0",
@@ -235,10 +258,10 @@ class StudyResults:
             "cells": len(self.plan.cells),
             "failures": flat_rows(self.failures),
             "notes": self.notes(),
-            "summary": flat_rows(self.summary),
-            "comparisons": flat_rows(self.comparisons),
-            "required": flat_rows(self.required),
-            "traces": self.traces,
+            "summary": (record.flat() for record in self.summary),
+            "comparisons": (record.flat() for record in self.comparisons),
+            "required": (record.flat() for record in self.required),
+            "traces": iter(self.traces),
         }
 
 
@@ -249,6 +272,7 @@ def compute_study(
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Callable[[str, int, int], object] = lambda what, done, total: None,
+    then: Callable[[StudyResults, RunAll], object] = lambda results, run: None,
 ) -> StudyResults:
     """Compute what is not yet finished, and sum up.
 
@@ -256,10 +280,12 @@ def compute_study(
         study: what is asked for.
         folder: where results are kept; finished cells found there are not computed again.
         base: the folder that relative paths of traces are from; the current one by default.
-        workers: processes on this machine; by default one for each core. No result depends on it.
+        workers: processes on this machine; by default one for each core, or this one alone where
+            there is little to do. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead, such as ``tcp://host:8786``;
             its workers must see the traces under the same paths.
         progress: told what is going on, how much of it is done, and of how much.
+        then: what is done in the end, with the results and the workers of this machine.
 
     Raises:
         LaeError: if the study cannot be planned, nothing could be computed, or a worker died.
@@ -270,7 +296,7 @@ def compute_study(
     check_inputs(folder, [*(source.input.path for source in plan.sources), *files])
     store = Store(folder)
     with store.locked():
-        return _run(plan, store, workers, scheduler, progress)
+        return _run(plan, store, workers, scheduler, progress, then)
 
 
 def check_inputs(folder: str | os.PathLike[str], inputs: Sequence[str | os.PathLike[str]]) -> None:
@@ -299,23 +325,26 @@ def _run(
     workers: int | None,
     scheduler: str | None,
     progress: Callable[[str, int, int], object],
+    then: Callable[[StudyResults, RunAll], object],
 ) -> StudyResults:
     study = plan.study
     store.prepare(plan.cells)
     asked = searches(plan.cells, study.require_auc) if study.require_auc else []
     described = [Description(source.input, study.sequences) for source in plan.sources]
     cells = [cell for cell in plan.cells if not store.has(cell)]
-    sought = [search for search in asked if store.document(search.key) is None]
+    sought = [search for search in asked if not store.holds(search.key)]
     needed = {*(cell.forecaster for cell in cells), *(each.cell.forecaster for each in sought)}
     factories, training = _factories(plan, needed, store, lambda what: progress(what, 0, 1))
     works: list[Work] = [
-        *(each for each in described if store.document(each.key) is None),
+        *(each for each in described if not store.holds(each.key)),
         *tasks(cells, factories),
         *(replace(search, factory=factories[search.cell.forecaster]) for search in sought),
     ]
     frames = {source.input: source.frames for source in plan.sources}
     pieces = [*batches(works, frames)]
-    workers = min(workers or cores(), max(len(pieces), 1))
+    if workers is None:
+        workers = cores() if seconds(works, frames) > ALONE else 1
+    workers = min(workers, max(len(pieces), 1))
     share = sum(
         amount(frames[cell.setting.trace] * cell.setting.count, len(study.sigmas)) for cell in cells
     )
@@ -332,32 +361,35 @@ def _run(
         if not scores:
             raise LaeError(f"nothing could be computed: {failures[0].reason}")
         compared = _compare(scores, study.seed, store, run, failures, progress)
-    progress("summing up", len(pieces), len(pieces))
-    answers = ((search, store.document(search.key)) for search in asked)
-    results = StudyResults(
-        folder=store.folder,
-        plan=plan,
-        scores=scores,
-        summary=tuple(summarise_study(scores, study.seed)),
-        comparisons=compared[0],
-        pairs=compared[1],
-        required=tuple(
-            requirement(search, Curve(**answer), auc)
-            for search, answer in answers
-            if answer
-            for auc in search.required
-        ),
-        traces=tuple(
-            dict(trace)
-            for trace in (store.document(each.key) for each in described)
-            if trace is not None
-        ),
-        computed=computed,
-        failures=tuple(sorted(failures, key=lambda failure: str(failure.flat()))),
-        training=tuple(training),
-    )
-    _write(results)
-    return results
+        progress("summing up", len(pieces), len(pieces))
+        answers = Answers(store.document(ANSWERS))
+        summary = tuple(summarise_study(scores, study.seed, answers=answers, run=run))
+        if answers.differ:
+            store.keep(ANSWERS, answers.document())
+        curves = ((search, store.document(search.key)) for search in asked)
+        results = StudyResults(
+            folder=store.folder,
+            plan=plan,
+            scores=scores,
+            summary=summary,
+            comparisons=compared[0],
+            pairs=compared[1],
+            required=tuple(
+                requirement(search, Curve(**curve), auc)
+                for search, curve in curves
+                if curve
+                for auc in search.required
+            ),
+            traces=Documents(
+                store.document, [each.key for each in described if store.holds(each.key)]
+            ),
+            computed=computed,
+            failures=tuple(sorted(failures, key=lambda failure: str(failure.flat()))),
+            training=tuple(training),
+        )
+        _write(results, store)
+        then(results, run_here if scheduler else run)
+        return results
 
 
 def _keep(batch: Batch, done: Done, store: Store, failures: list[Failure]) -> int:
@@ -432,15 +464,18 @@ def _factories(
     return factories, notes
 
 
-def _write(results: StudyResults) -> None:
-    """Write the summary, as CSV and JSON."""
+def _write(results: StudyResults, store: Store) -> None:
+    """Write the summary, as CSV and JSON, unless those are there that were written of the same."""
     tables: dict[str, Sequence[Record]] = {
-        "summary": results.summary,
-        "comparisons": results.comparisons,
-        "required": results.required,
+        "summary.csv": results.summary,
+        "comparisons.csv": results.comparisons,
+        "required.csv": results.required,
     }
+    paths = [results.folder / name for name in ("study.json", *tables)]
+    if (before := store.document(TABLES)) and before == _written(results, paths):
+        return
     for name, records in tables.items():
-        path = results.folder / f"{name}.csv"
+        path = results.folder / name
         if records:
             write_csv(records, path)
         else:
@@ -449,7 +484,24 @@ def _write(results: StudyResults) -> None:
         written_whole(results.folder / "study.json") as temporary,
         open(temporary, "w", encoding="utf-8") as file,
     ):
-        file.writelines(_json(results.document()))
+        file.writelines(_json(results._document()))
+    store.keep(TABLES, _written(results, paths))
+
+
+def _written(results: StudyResults, paths: Sequence[Path]) -> dict[str, Any]:
+    """Digests of all that the summary depends on, and of those of its files that are there."""
+    plan = results.plan
+    made_of = (
+        __version__,
+        Resamples(plan.study.seed).key(),
+        plan.study.document(),
+        [(source.input.label, source.input.digest) for source in plan.sources],
+        [cell.key for cell in plan.cells],
+        [failure.flat() for failure in results.failures],
+        results.training,
+    )
+    files = {path.name: digest(str(path)) for path in paths if path.exists()}
+    return {"of": text_digest(repr(made_of)), "files": files}
 
 
 def _json(document: Mapping[str, Any]) -> Iterator[str]:
@@ -457,7 +509,7 @@ def _json(document: Mapping[str, Any]) -> Iterator[str]:
     yield "{"
     for place, (key, value) in enumerate(document.items()):
         yield f"{', ' * bool(place)}{json.dumps(key)}: "
-        if isinstance(value, (list, tuple)):
+        if isinstance(value, (list, Iterator)):
             yield "["
             for i, each in enumerate(value):
                 yield f"{', ' * bool(i)}{json.dumps(each, allow_nan=False)}"
@@ -469,15 +521,16 @@ def _json(document: Mapping[str, Any]) -> Iterator[str]:
 
 def write_csv(records: Sequence[Record], path: Path) -> None:
     """Write records as CSV, whole or not at all; what is unknown is empty."""
-    rows = flat_rows(records)
-    columns = list(dict.fromkeys(chain.from_iterable(rows)))
+    columns = list(dict.fromkeys(chain.from_iterable(record.flat() for record in records)))
     with (
         written_whole(path) as temporary,
         open(temporary, "w", newline="", encoding="utf-8", errors="backslashreplace") as file,
     ):
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
-        writer.writerows([csv_cell(row.get(name)) for name in columns] for row in rows)
+        for record in records:
+            row = record.flat()
+            writer.writerow([csv_cell(row.get(name)) for name in columns])
 
 
 def flat_rows(records: Sequence[Record]) -> list[dict[str, Any]]:

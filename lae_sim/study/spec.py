@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import difflib
 import os
-import re
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from fractions import Fraction
@@ -13,30 +11,27 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from lae_sim.decoding import Budget, read_bytes
+from lae_sim.decoding import read_toml
 from lae_sim.engine.clock import exact, parse_duration, parse_fps, split_init, whole
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.plugins import looking_in
-from lae_sim.replay.search import parse_search
-from lae_sim.replay.world import (
-    check_sigmas,
+from lae_sim.replay.names import (
     flag,
     kind_of,
     named,
     parse_latency,
     parse_policy,
-    parse_sigmas,
     several,
     text,
 )
+from lae_sim.replay.search import parse_search
+from lae_sim.replay.world import check_sigmas, parse_sigmas
 from lae_sim.trace.file import Trace
 
 RANDOM = ("bootstrap", "resample", "lognormal")
 """Latencies that are drawn anew in each repetition."""
-
-_NESTED_KEY = re.compile(r"(?:[\w\"'-]+[ \t]*\.[ \t]*){32}")
 
 Value = TypeVar("Value")
 
@@ -203,22 +198,10 @@ def read_study(path: str | os.PathLike[str]) -> Study:
         >>> study.traces, study.latencies
         (('synthetic-slow.parquet', 'synthetic-fast.parquet'), ('recorded', 'bootstrap'))
     """
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
-
     if not isinstance(path, (str, os.PathLike)):
         raise LaeError(f"path: a study is read from a TOML file, not {shown(path)}")
+    document = read_toml(path, "a study")
     try:
-        content = read_bytes(Path(path), Budget(path)).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise LaeError(f"{path}: cannot be read: {error}") from error
-    try:
-        if _NESTED_KEY.search(content):  # for which tomllib takes the square of its length
-            raise RecursionError
-        # numbers stay as they are written: no float comes between
-        document = tomllib.loads(content, parse_float=str)
         with looking_in(Path(path).parent):
             return Study.of(document)
     except RecursionError as error:

@@ -5,22 +5,23 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from sys import intern
-from typing import Any
-
-import numpy as np
+from typing import Any, Generic, TypeVar, overload
 
 from lae_sim.errors import LaeError
 from lae_sim.files import locked, remove_leftovers, text_digest, written_whole
 from lae_sim.study.cells import Cell, Result
 from lae_sim.study.rows import RowsFile, read_rows
 
+Key = TypeVar("Key")
+
 _FILES = "[0-9a-f]" * 32 + ".parquet"
-_BYTES, _DIGEST = "rows_bytes", "sha256"  # what the files say of themselves
+_BYTES, _PLACES = "rows_bytes", "places"  # what a file of details says of that of rows
+_DIGEST = '{"sha256": "'  # how a file of details begins: with a digest of what follows
+_AFTER = len(_DIGEST) + 32
 
 
 @dataclass(frozen=True)
@@ -30,16 +31,18 @@ class Part:
     Attributes:
         name: of both files, without suffix.
         size: of the file of rows, bytes.
-        cells: by key what is known of each cell beside its rows (see :class:`Result`).
-        places: the first row of each cell, and how many it has.
-        documents: others that were made together with these, by their keys.
+        places: by the keys of its cells the first row of each, and how many it has.
+        documents: keys of others that were made together with these.
+        cells, texts: what is known of the cells beside their rows (see :class:`Result`), and the
+            documents, by their keys.
     """
 
     name: str
     size: int
-    cells: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    places: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    places: Mapping[str, tuple[int, int]]
+    documents: Sequence[str]
+    cells: Packed
+    texts: Packed
 
     @classmethod
     def of(
@@ -50,19 +53,55 @@ class Part:
         return cls(
             name=keys[0] if len(keys) == 1 else text_digest(" ".join(keys)),
             size=size,
-            cells={result.key: _packed(result.about) for result in results},
             places={result.key: (result.first, result.count) for result in results},
-            documents=documents,
+            documents=[*documents],
+            cells=Packed.of(_text({result.key: result.about for result in results})),
+            texts=Packed.of(_text(documents)),
         )
 
-    def plain(self) -> dict[str, Any]:
-        """What its file holds."""
-        return {
-            "cells": {key: _unpacked(about) for key, about in self.cells.items()},
-            "places": {key: list(place) for key, place in self.places.items()},
-            "documents": self.documents,
-            _BYTES: self.size,
-        }
+    def written(self) -> str:
+        """What its file holds: a line that says what there is, and a line of either kind."""
+        places = {key: list(place) for key, place in self.places.items()}
+        head = {_PLACES: places, "documents": self.documents, _BYTES: self.size}
+        return "\n".join([_text(head), self.cells.text, self.texts.text])
+
+    @classmethod
+    def read(cls, name: str, text: str) -> Part:
+        """That of such a file."""
+        head, cells, texts = text.split("\n")
+        about = _object(head)
+        places = {key: (first, count) for key, (first, count) in about[_PLACES].items()}
+        packed = Packed.of(cells), Packed.of(texts)
+        return cls(name, about[_BYTES], places, about["documents"], *packed)
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Text in as few bytes as may be: as objects it would take many times the memory.
+
+    Attributes:
+        size: bytes of the text.
+        packed: the text, compressed.
+    """
+
+    size: int
+    packed: bytes
+
+    @classmethod
+    def of(cls, text: str) -> Packed:
+        """That of a text."""
+        import pyarrow as pa
+
+        plain = text.encode()
+        return cls(len(plain), pa.compress(plain, codec="zstd", asbytes=True))
+
+    @property
+    def text(self) -> str:
+        """The text."""
+        import pyarrow as pa
+
+        plain: bytes = pa.decompress(self.packed, self.size, codec="zstd", asbytes=True)
+        return plain.decode()
 
 
 class Store:
@@ -80,7 +119,8 @@ class Store:
             self.folder / name for name in ("results", "about", "unused")
         )
         self._parts: dict[str, Part] = {}  # by the keys of their cells and documents
-        self._read: tuple[object, Any] | None = None
+        self._read: tuple[str, tuple[str, ...] | None, Any] | None = None
+        self._unpacked: tuple[Packed, dict[str, Any]] | None = None
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -124,17 +164,17 @@ class Store:
         """Look at what a finished study left, without changing anything."""
         for part, rows in self._found():
             if rows.parent == self.results:
-                self._remember(part, part.cells)
+                self._remember(part, part.places)
 
     def _sort(self, wanted: set[str]) -> None:
         """Move the files to where they belong, and divide those that belong to both."""
         here: set[Path] = set()
         for part, place in [*self._found()]:
-            kept = {key for key in part.cells if key in wanted and key not in self._parts}
-            if kept and len(kept) < len(part.cells):
+            kept = {key for key in part.places if key in wanted and key not in self._parts}
+            if kept and len(kept) < len(part.places):
                 self._divide(part, place, kept)
                 continue
-            if part.cells:
+            if part.places:
                 target = (self.results if kept else self._unused) / place.name
                 if target != place:
                     place.replace(target)
@@ -152,19 +192,13 @@ class Store:
     def _found(self) -> Iterator[tuple[Part, Path]]:
         """What is whole, with the file of its rows, in the order of the names."""
         for path in sorted(self._about.glob("*.json")):
-            document = self._document(path.stem)
-            if document is None or "cells" not in document:
+            text = self._whole(path.stem)
+            if text is None or not text.startswith(f'{{"{_PLACES}": '):
                 continue
-            part = Part(
-                path.stem,
-                document[_BYTES],
-                {key: _packed(about) for key, about in document["cells"].items()},
-                {key: (first, count) for key, (first, count) in document["places"].items()},
-                document["documents"],
-            )
+            part = Part.read(path.stem, text)
             for folder in (self.results, self._unused):
                 rows = folder / f"{path.stem}.parquet"
-                if not part.cells or (rows.is_file() and rows.stat().st_size == part.size):
+                if not part.places or (rows.is_file() and rows.stat().st_size == part.size):
                     yield part, rows
                     break
 
@@ -172,8 +206,8 @@ class Store:
         """Divide a file into one of the cells that are kept, and one of the others."""
         table = read_rows(place)
         for folder, chosen in (
-            (self.results, [key for key in part.cells if key in kept]),
-            (self._unused, [key for key in part.cells if key not in kept]),
+            (self.results, [key for key in part.places if key in kept]),
+            (self._unused, [key for key in part.places if key not in kept]),
         ):
             file, results = RowsFile(), []
             for key in chosen:
@@ -181,8 +215,8 @@ class Store:
                 for batch in table.slice(first, count).to_batches():
                     file.write(batch, soon=False)
                 first = file.rows - count
-                results.append(Result(key, b"", first, count, dict(part.cells[key])))
-            documents = part.documents if folder == self.results else {}
+                results.append(Result(key, b"", first, count, self._opened(part.cells)[key]))
+            documents = self._opened(part.texts) if folder == self.results else {}
             self._put(results, documents, file.finish(), folder)
         place.unlink()
         self._details(part.name).unlink()
@@ -219,37 +253,53 @@ class Store:
         folder: Path,
     ) -> None:
         part = Part.of(results, documents, len(rows))
-        self._write(part.name, part.plain())
+        self._write(part.name, part.written())
         if results:
             with written_whole(folder / f"{part.name}.parquet") as temporary:
                 temporary.write_bytes(rows)
-        self._remember(part, part.cells if folder == self.results else ())
+        self._remember(part, part.places if folder == self.results else ())
 
-    def document(self, key: str) -> Mapping[str, Any] | None:
+    def document(self, key: str) -> dict[str, Any] | None:
         """A document that was kept under a key, if it was, and is as it was written."""
-        part = self._parts.get(key)
-        return part.documents[key] if part is not None else self._document(key)
+        if (part := self._parts.get(key)) is not None:
+            document: dict[str, Any] = self._opened(part.texts)[key]
+            return document
+        with suppress(ValueError, RecursionError):
+            return None if (text := self._whole(key)) is None else _object(text)
+        return None
+
+    def holds(self, key: str) -> bool:
+        """Whether such a document is there, and as it was written."""
+        return key in self._parts or self._whole(key) is not None
 
     def keep(self, key: str, document: Mapping[str, Any]) -> None:
         """Keep a document under a key, with its digest."""
-        self._write(key, document)
+        self._write(key, _text(document))
 
-    def _document(self, name: str) -> dict[str, Any] | None:
-        with suppress(OSError, ValueError, RecursionError):
-            document = json.loads(self._details(name).read_text("utf-8"))
-            if isinstance(document, dict) and document.pop(_DIGEST, None) == _digest(document):
-                return document
+    def _opened(self, packed: Packed) -> dict[str, Any]:
+        """What is packed, by its keys; that of the last time is at hand."""
+        if self._unpacked is None or self._unpacked[0] is not packed:
+            self._unpacked = packed, _object(packed.text)
+        return self._unpacked[1]
+
+    def _whole(self, name: str) -> str | None:
+        """What a file of details holds, if it is there, and as it was written."""
+        with suppress(OSError, ValueError):
+            whole = self._details(name).read_text("utf-8")
+            if whole[:_AFTER] == _digest(whole[_AFTER:]):
+                return "{" + whole[_AFTER + len('", ') :]
         return None
 
-    def _write(self, name: str, document: Mapping[str, Any]) -> None:
-        text = json.dumps({**document, _DIGEST: _digest(document)}, allow_nan=False)
+    def _write(self, name: str, text: str) -> None:
+        """Write a JSON object, and perhaps more lines, with their digest."""
+        rest = f'", {text[1:]}'
         with written_whole(self._details(name)) as temporary:
-            temporary.write_text(text, "utf-8")
+            temporary.write_text(_digest(rest) + rest, "utf-8")
 
     @property
     def files(self) -> list[Path]:
         """The files of rows, in the order of their names."""
-        names = {part.name for part in self._parts.values() if part.cells}
+        names = {part.name for part in self._parts.values() if part.places}
         return [self.results / f"{name}.parquet" for name in sorted(names)]
 
     def rows(self, cell: Cell, columns: Sequence[str] | None = None) -> Any:
@@ -258,36 +308,76 @@ class Store:
         Raises:
             LaeError: if the file is damaged; it says what to do.
         """
+        _, first, count = self.place(cell)
+        return self.file(cell, columns).slice(first, count)
+
+    def file(self, cell: Cell, columns: Sequence[str] | None = None) -> Any:
+        """The same of all cells whose rows are in its file (see :meth:`place`)."""
+        part, wanted = self._parts[cell.key], None if columns is None else tuple(columns)
+        if self._read is None or self._read[:2] != (part.name, wanted):
+            self._read = None  # or two of them would be held
+            rows = read_rows(self.results / f"{part.name}.parquet", columns)
+            self._read = part.name, wanted, rows
+        return self._read[2]
+
+    def forget(self) -> None:
+        """Let go of what was read last."""
+        self._read = self._unpacked = None
+
+    def place(self, cell: Cell) -> tuple[str, int, int]:
+        """The file of a finished cell's rows, the first of them in it, and how many they are."""
         part = self._parts[cell.key]
-        wanted = part.name, None if columns is None else tuple(columns)
-        if self._read is None or self._read[0] != wanted:
-            self._read = wanted, read_rows(self.results / f"{part.name}.parquet", columns)
-        return self._read[1].slice(*part.places[cell.key])
+        return part.name, *part.places[cell.key]
 
     def about(self, cell: Cell) -> Mapping[str, Any]:
         """What is known of a finished cell beside its rows (see :class:`Result`)."""
-        return self._parts[cell.key].cells[cell.key]
+        about: Mapping[str, Any] = self._opened(self._parts[cell.key].cells)[cell.key]
+        return about
 
     def _details(self, key: str) -> Path:
         return self._about / f"{key}.json"
 
 
-def _packed(about: Mapping[str, Any]) -> dict[str, Any]:
-    """What is known of a cell, with its curves as arrays: lists take four times the memory."""
-    curves = about["curves"].items()
-    packed = {name: None if curve is None else np.asarray(curve) for name, curve in curves}
-    return {**about, "curves": packed, "notes": [*map(intern, about["notes"])]}
+class Documents(Sequence[Mapping[str, Any]], Generic[Key]):
+    """Documents, each made when it is looked at: all at once they may be large.
+
+    Args:
+        look: gives that of a key.
+        keys: of the documents.
+    """
+
+    __slots__ = ("_keys", "_look")
+
+    def __init__(
+        self, look: Callable[[Key], Mapping[str, Any] | None], keys: Sequence[Key]
+    ) -> None:
+        self._look, self._keys = look, keys
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    @overload
+    def __getitem__(self, place: int) -> Mapping[str, Any]: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[Mapping[str, Any]]: ...
+    def __getitem__(self, place: int | slice) -> Mapping[str, Any] | list[Mapping[str, Any]]:
+        if isinstance(place, slice):
+            return [self[i] for i in range(len(self))[place]]
+        document = self._look(self._keys[place])
+        if document is None:
+            raise LaeError("the study's folder has changed since it ended: run it again")
+        return document
 
 
-def _unpacked(about: Mapping[str, Any]) -> dict[str, Any]:
-    """The same as JSON has it."""
-    curves = about["curves"].items()
-    return {
-        **about,
-        "curves": {name: None if curve is None else curve.tolist() for name, curve in curves},
-    }
+def _text(document: Mapping[str, Any]) -> str:
+    return json.dumps(document, allow_nan=False)
 
 
-def _digest(document: Mapping[str, Any]) -> str:
-    """Of all that a document holds, in its order."""
-    return text_digest(json.dumps(document, allow_nan=False))
+def _object(text: str) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(text)
+    return document
+
+
+def _digest(rest: str) -> str:
+    """How a file of details begins whose rest this is."""
+    return _DIGEST + text_digest(rest)

@@ -7,21 +7,25 @@ for these very sequences.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cached_property, partial
+from itertools import groupby, islice, product
 from sys import intern
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from lae_sim._arrays import Bools, Floats
-from lae_sim.comparison.statistics import RESAMPLES, Bootstrap, Difference, Interval, holm
+from lae_sim.comparison.statistics import RESAMPLES, Interval, holm
 from lae_sim.engine.clock import Clock
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED, Ranking, interval, summed
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.study.cells import Cell, Setting
+from lae_sim.study.cells import Cell, Input, Setting
+from lae_sim.study.executors import RunAll, run_here
 from lae_sim.study.plan import Plan, Source
 from lae_sim.study.records import (
     MEAN,
@@ -32,7 +36,17 @@ from lae_sim.study.records import (
     Uncertainty,
 )
 from lae_sim.study.rows import COLUMNS
-from lae_sim.study.store import Store
+from lae_sim.study.store import Documents, Store
+from lae_sim.study.uncertainty import (
+    Answers,
+    Resamples,
+    Sample,
+    difference_of,
+    differences,
+    plain,
+    uncertainties,
+    uncertainty_of,
+)
 from lae_sim.trace.columns import to_numpy
 
 
@@ -54,9 +68,15 @@ class Scores:
         over_sigmas: ``auc`` and ``dp20`` as plain means over sigma, float64 [R, S].
         once: means by sequence of ``world_frames``, ``processed``, ``elapsed_ms``, ``init_ms``,
             ``lost_share`` and the offline scores, float64 [S].
-        modelled_sequences: in how many the search model says something.
-        about: of each cell (see :class:`lae_sim.study.cells.Result`).
         keys: of each cell.
+        about: of each cell (see :class:`lae_sim.study.cells.Result`); made anew at each look.
+        engine, init_source: as of a row of the summary.
+        calls, departures: processed frames but the initialisations, and those of them whose output
+            follows another frame than when it was recorded.
+        notes: on the replays.
+        known: whether the reach is known; None where nothing is modelled.
+        reach_sources: from where it is known, of each cell where something is modelled.
+        intervals: of modelled AUC and DP, at the ``"first"`` sigma and of the ``"mean"`` over them.
     """
 
     source: Source
@@ -68,22 +88,23 @@ class Scores:
     repeated: Mapping[str, Floats]
     over_sigmas: Mapping[str, Floats]
     once: Mapping[str, Floats]
-    about: tuple[Mapping[str, Any], ...]
-    modelled_sequences: int
     keys: tuple[str, ...]
-
-    @property
-    def known(self) -> bool | None:
-        """Whether the reach is known; None where nothing is modelled."""
-        found = {each["modelled"]["known"] for each in self.about if each["modelled"]}
-        return found.pop() if found else None
+    about: Sequence[Mapping[str, Any]]
+    engine: str
+    init_source: str
+    calls: int
+    departures: int
+    notes: tuple[str, ...]
+    known: bool | None
+    reach_sources: tuple[str, ...]
+    intervals: Mapping[str, Mapping[str, Interval]]
 
     @property
     def is_exact(self) -> bool:
         """Whether every output follows the same frame as when it was recorded."""
-        return not any(each["approximate_outputs"] for each in self.about)
+        return not self.departures
 
-    @property
+    @cached_property
     def group(self) -> tuple[str, ...]:
         """What scores must share to be compared: dataset, world, latency, search, convention."""
         setting = self.setting
@@ -108,12 +129,45 @@ class Scores:
         return self.over_sigmas if over_sigmas else self.repeated
 
 
+FEW = 20_000
+"""Sequences of missing answers, about, that are sooner resampled here than handed to workers."""
+
+_AS_DEAR = 30  # sequences as the rest of an answer
+_PIECE = 128  # answers
 _WORST = {"age_max", "longest_stale"}
 _STALENESS = ("mismatch_mean", "age_mean", *sorted(_WORST))
 _REPEATED = ("auc", "dp20", "failure_frame", "failure_time")
 _ONCE = ("world_frames", "processed", "elapsed_ms", "init_ms", "lost_share",
          *(f"offline_{m}" for m in METRICS))  # fmt: skip
 _MODELLED = tuple(f"modelled_{metric}" for metric in MODELLED)
+_Group: TypeAlias = tuple[Sequence[Cell], Sequence[Mapping[str, Any]]]
+_READ = tuple(dict.fromkeys(
+    ["sequence", "repetition", *METRICS, *_STALENESS, *_MODELLED, *_REPEATED, *_ONCE]
+))  # fmt: skip
+
+
+class Layer(Mapping[str, Floats]):
+    """One of several of the same shape, whose arrays are held together.
+
+    Args:
+        arrays: of all of them, along the first axis.
+        place: of this one there.
+    """
+
+    __slots__ = ("_arrays", "_place")
+
+    def __init__(self, arrays: Mapping[str, Floats], place: int) -> None:
+        self._arrays, self._place = arrays, place
+
+    def __getitem__(self, name: str) -> Floats:
+        values: Floats = self._arrays[name][self._place]
+        return values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        return len(self._arrays)
 
 
 def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
@@ -123,82 +177,183 @@ def read_scores(plan: Plan, store: Store) -> Iterator[Scores]:
     for cell in plan.cells:
         same = replace(cell.setting, first=0, count=1)
         together.setdefault((same, cell.forecaster, cell.convention), []).append(cell)
-    for cells in together.values():
-        if all(store.has(cell) for cell in cells):
-            yield _read(cells, sources[cells[0].setting.trace], store)
-
-
-def _read(cells: Sequence[Cell], source: Source, store: Store) -> Scores:
-    """The scores of cells that differ in their repetitions alone."""
-    first = cells[0]
-    count = len(first.setting.world.sigmas)
-    about = tuple(store.about(cell) for cell in cells)
-    modelled = _MODELLED if any(each["modelled"] for each in about) else ()
-    numbers = [*METRICS, *_STALENESS, *modelled]
-    totals: dict[str, Any] = {}
-    repeated: dict[str, list[Floats]] = {name: [] for name in (*_REPEATED, *modelled)}
-    over_sigmas: dict[str, list[Floats]] = {name: [] for name in ("auc", "dp20", *modelled)}
-    applies: Bools | None = None
-    names: tuple[str, ...] = ()
-    for cell in cells:
-        wanted = dict.fromkeys([*numbers, *_REPEATED, *_ONCE])
-        rows = store.rows(cell, [*wanted, "sequence", "repetition"])
-        exact = np.isnan(_column(rows, "lost_share"))
-
-        def column(name: str, rows: Any = rows, exact: Bools = exact) -> Floats:
-            values = _column(rows, name)
-            if name in _MODELLED:
-                return np.where(exact, _column(rows, name.removeprefix("modelled_")), values)
-            return np.where(exact, 0.0, values) if name == "lost_share" else values
-
-        entries = rows.num_rows // count
-        sequences = rows.column("sequence").chunk(0)  # its take would import pyarrow.compute
-        of_entry = [sequences[row].as_py() for row in range(0, rows.num_rows, count)]
-        names = tuple(map(intern, sorted(set(of_entry))))
-        place = {name: s for s, name in enumerate(names)}
-        order = np.lexsort((  # by repetition, then by sequence
-            np.array([place[name] for name in of_entry]), column("repetition")[::count],
-        ))  # fmt: skip
-        shape = (cell.setting.count, len(names), count)
-        modelled_here = ~exact & (column("failure_frame") >= 0)  # and scored
-        here = np.logical_or.reduce(modelled_here[::count][order].reshape(shape[:2]))
-        applies = here if applies is None else np.logical_or(applies, here)
-        for name in wanted:
-            values = column(name).reshape(entries, count)[order].reshape(shape)
-            if name in repeated:
-                repeated[name].append(values[:, :, 0])
-            if name in over_sigmas:
-                over_sigmas[name].append(values.mean(axis=2))
-            values = values[:, :, 0] if name in _ONCE else values
-            # one after another from the first repetition on, however they were dealt out
-            before = [totals[name][None]] if name in totals else []
-            combine = np.maximum if name in _WORST else np.add
-            totals[name] = combine.reduce(np.concatenate([*before, values]))
-    count = sum(cell.setting.count for cell in cells)
-    for name in totals.keys() - _WORST:
-        totals[name] = totals[name] / count
-    return Scores(
-        source=source,
-        setting=first.setting,
-        forecaster=first.forecaster,
-        convention=first.convention,
-        sequences=names,
-        means={name: totals[name] for name in numbers},
-        repeated={name: np.concatenate(parts) for name, parts in repeated.items()},
-        over_sigmas={name: np.concatenate(parts) for name, parts in over_sigmas.items()},
-        once={name: totals[name] for name in _ONCE},
-        about=about,
-        modelled_sequences=0 if applies is None else int(applies.sum()),
-        keys=tuple(cell.key for cell in cells),
+    finished = (
+        (cells, tuple(store.about(cell) for cell in cells))
+        for cells in together.values()
+        if all(map(store.has, cells))
     )
 
+    def alike(group: _Group) -> tuple[object, ...]:
+        """What those have in common that are read at once."""
+        cells, about = group
+        setting, (file, _, rows) = cells[0].setting, store.place(cells[0])
+        is_modelled = about[0]["modelled"] is not None
+        alone = cells[0].key if len(cells) > 1 else ""
+        return file, rows, setting.count, len(setting.world.sigmas), is_modelled, alone
 
-def _column(rows: Any, name: str) -> Floats:
-    return to_numpy(rows.column(name).chunk(0), COLUMNS[name]).astype(np.float64)
+    for _, some in groupby(finished, alike):
+        groups, about = zip(*some)
+        yield from _read(groups, about, sources, store)
+    store.forget()
+
+
+def _read(
+    groups: Sequence[Sequence[Cell]],
+    about: Sequence[Sequence[Mapping[str, Any]]],
+    sources: Mapping[Input, Source],
+    store: Store,
+) -> Iterator[Scores]:
+    """The scores of some groups of cells, each of the same shape and with its rows in one file.
+
+    The cells of a group differ in their repetitions alone: where there is more than one group, each
+    is of one cell.
+    """
+    modelled = _MODELLED if any(each["modelled"] for each in about[0]) else ()
+    totals: dict[str, Floats] = {}  # by group and sequence, and by sigma or not
+    repeated: dict[str, list[Floats]] = {name: [] for name in (*_REPEATED, *modelled)}
+    over_sigmas: dict[str, list[Floats]] = {name: [] for name in (*MODELLED, *modelled)}
+    applies: Bools | None = None
+    names: list[tuple[str, ...]] = []
+    for cells in zip(*groups):
+        entries = _Entries(cells, store)
+        names, here = entries.names, entries.is_modelled
+        applies = here if applies is None else np.logical_or(applies, here)
+        for name in dict.fromkeys([*METRICS, *_STALENESS, *modelled, *_REPEATED, *_ONCE]):
+            values = entries.column(name)
+            if name in repeated:
+                repeated[name].append(values[..., 0])
+            if name in over_sigmas:
+                over_sigmas[name].append(values.mean(axis=3))
+            if name in _ONCE:
+                values = values[..., 0]
+            # one after another from the first repetition on, however they were dealt out
+            before = [totals[name][:, None]] if name in totals else []
+            combine = np.maximum if name in _WORST else np.add
+            totals[name] = combine.reduce(np.concatenate([*before, values], axis=1), axis=1)
+    count = sum(cell.setting.count for cell in groups[0])
+    for name in totals.keys() - _WORST:
+        totals[name] = totals[name] / count
+    means = {name: totals[name] for name in (*METRICS, *_STALENESS, *modelled)}
+    once = {name: totals[name] for name in _ONCE}
+    by_repetition, plain_means = (
+        {name: np.concatenate(parts, axis=1) for name, parts in some.items()}
+        for some in (repeated, over_sigmas)
+    )
+    for n, group in enumerate(groups):
+        yield Scores(
+            source=sources[group[0].setting.trace],
+            setting=group[0].setting,
+            forecaster=group[0].forecaster,
+            convention=group[0].convention,
+            sequences=names[n],
+            means=Layer(means, n),
+            repeated=Layer(by_repetition, n),
+            over_sigmas=Layer(plain_means, n),
+            once=Layer(once, n),
+            keys=tuple(cell.key for cell in group),
+            about=Documents(store.about, group),
+            engine=intern(about[n][0]["engine"]),
+            init_source=intern(about[n][0]["init_source"]),
+            calls=sum(each["calls"] for each in about[n]),
+            departures=sum(each["approximate_outputs"] for each in about[n]),
+            notes=tuple(intern(note) for each in about[n] for note in each["notes"]),
+            known=next((each["modelled"]["known"] for each in about[n] if each["modelled"]), None),
+            reach_sources=tuple(
+                intern(each["modelled"]["source"]) for each in about[n] if each["modelled"]
+            ),
+            intervals=_intervals(
+                about[n],
+                0 if applies is None else int(applies[n].sum()),
+                _is_whole_grid(group[0].setting.world.sigmas),
+            ),
+        )
+
+
+def _intervals(
+    about: Sequence[Mapping[str, Any]], sequences: int, over_sigmas: bool
+) -> dict[str, dict[str, Interval]]:
+    """Intervals of modelled scores, from the joint draws of cells; none where they say nothing.
+
+    Args:
+        about: of cells that differ in their repetitions alone.
+        sequences: of how many the search model says something.
+        over_sigmas: whether those of the means over sigma are wanted too.
+    """
+    cells = [each["modelled"] for each in about if each["modelled"]]
+    repetitions = sum(each["repetitions"] for each in about)
+    found: dict[str, dict[str, Interval]] = {}
+    wanted = ("first", "mean")[: 1 + over_sigmas] if cells else ()
+    for draws, metric in product(wanted, MODELLED):
+        runs = summed([np.array(cell[draws][metric]) for cell in cells])
+        # of one sequence, what is drawn and what is unexplained are the same in all repetitions
+        each = runs[:, None, :, None] / repetitions
+        rest = max(cell["unexplained"][metric] for cell in cells)
+        low, high = interval(each, cells[0]["known"], rest, sequences)
+        if np.isfinite(low).all():
+            # in whatever chunks repetitions are dealt out, whose sums differ in the last bits
+            ends = (round(end.item(), 12) for end in (low, high))
+            found.setdefault(draws, {})[metric] = Interval(*ends)
+    return found
+
+
+class _Entries:
+    """The rows of N cells of the same shape, which stand in the same file.
+
+    Attributes:
+        names: of each cell's sequences, sorted.
+    """
+
+    def __init__(self, cells: Sequence[Cell], store: Store) -> None:
+        self._file = store.file(cells[0], _READ)
+        setting = cells[0].setting
+        count, repetitions = len(setting.world.sigmas), setting.count
+        sequences = self._file.column("sequence").chunk(0)  # its take imports pyarrow.compute
+        repetition = to_numpy(self._file.column("repetition").chunk(0), COLUMNS["repetition"])
+        known: dict[tuple[str, ...], tuple[str, ...]] = {}  # most are the same
+        self.names, rows = [], []
+        for cell in cells:
+            _, first, size = store.place(cell)
+            some = np.arange(first, first + size, count)  # the first row of each entry
+            of_entry = [sequences[row].as_py() for row in some.tolist()]
+            names = tuple(map(intern, sorted(set(of_entry))))
+            place = {name: s for s, name in enumerate(names)}
+            by_name = np.array([place[name] for name in of_entry])
+            # by repetition, then by sequence
+            rows.append(some[np.lexsort((by_name, repetition[some]))])
+            self.names.append(known.setdefault(names, names))
+        places = np.stack(rows).reshape(len(cells), repetitions, -1, 1)
+        self._rows = places + np.arange(count)  # [N, R, S, M]
+        self._exact = np.isnan(self._values("lost_share"))
+
+    @property
+    def is_modelled(self) -> Bools:
+        """Of which sequences the search model says something that is scored, bool [N, S]."""
+        here = ~self._exact[..., 0] & (self._values("failure_frame")[..., 0] >= 0)
+        modelled: Bools = np.logical_or.reduce(here, axis=1)
+        return modelled
+
+    def column(self, name: str) -> Floats:
+        """A column by cell, repetition, sequence and sigma, float64 [N, R, S, M].
+
+        What is modelled is as recorded where the replay is exact, and no output is lost there.
+        """
+        values = self._values(name)
+        if name in _MODELLED:
+            return np.where(self._exact, self._values(name.removeprefix("modelled_")), values)
+        return np.where(self._exact, 0.0, values) if name == "lost_share" else values
+
+    def _values(self, name: str) -> Floats:
+        values = to_numpy(self._file.column(name).chunk(0), COLUMNS[name])
+        chosen: Floats = values[self._rows].astype(np.float64, copy=False)
+        return chosen
 
 
 def summarise_study(
-    scores: Sequence[Scores], seed: int = 0, resamples: int = RESAMPLES
+    scores: Sequence[Scores],
+    seed: int = 0,
+    resamples: int = RESAMPLES,
+    answers: Answers | None = None,
+    run: RunAll = run_here,
 ) -> list[SummaryRow]:
     """A row per trace, setting, convention, forecaster and sigma, and one of their means.
 
@@ -206,20 +361,23 @@ def summarise_study(
         scores: all of a study.
         seed: of the resamples.
         resamples: of the bootstrap.
+        answers: those that are known, which are not sought again; new ones are added.
+        run: the workers, for what is worth to be handed to them.
 
     Returns:
         Rows in the order of the scores. Intervals and tests stand in the rows of the first sigma
         and of the mean over sigma; so does how far each trace with each forecaster is behind the
         best of those with the same sequences.
     """
-    bootstrap = Bootstrap(resamples, seed)
+    how, answers = Resamples(seed, resamples), Answers() if answers is None else answers
     hold = {each.identity: each for each in scores if each.forecaster == "hold"}
     rankings = rankings_of(scores)
+    _resample([(each, hold.get(each.identity)) for each in scores], how, answers, run)
     rows: list[SummaryRow] = []
     rivals: dict[tuple[Any, ...], list[int]] = {}
     ranks: dict[tuple[Any, ...], list[tuple[int, Scores]]] = {}
     for each in scores:
-        for row in _rows(each, hold.get(each.identity), bootstrap):
+        for row in _rows(each, hold.get(each.identity), how, answers):
             row = replace(row, ranked_by=rankings[each.group].by)
             rival = (*each.group, each.sequences, each.forecaster, row.sigma)
             rivals.setdefault(rival, []).append(len(rows))
@@ -232,14 +390,14 @@ def summarise_study(
             rows[places[place]] = replace(rows[places[place]], pareto=True)
     for some in ranks.values():
         ranked_rows = [(rows[place], each) for place, each in some]
-        behind = _behind(ranked_rows, rankings[some[0][1].group], bootstrap)
+        behind = _behind(ranked_rows, rankings[some[0][1].group], how, answers)
         for (place, _), found in zip(some, behind):
             rows[place] = replace(rows[place], behind=found)
     return rows
 
 
 def _behind(
-    rivals: Sequence[tuple[SummaryRow, Scores]], ranking: Ranking, bootstrap: Bootstrap
+    rivals: Sequence[tuple[SummaryRow, Scores]], ranking: Ranking, how: Resamples, answers: Answers
 ) -> list[Behind | None]:
     """How far each of some rows is behind the best of them; None of that one.
 
@@ -248,14 +406,22 @@ def _behind(
     1996, Ch. 4.
     """
     best, of_best = max(rivals, key=lambda rival: rival[0].score("auc") or 0)
-    known: dict[int, Difference] = {}
-    for i, (row, scores) in enumerate(rivals):
-        if row is not best:
-            first, second = _paired(scores, of_best, ranking, row.sigma == MEAN)
+    over_sigmas = best.sigma == MEAN
+    keys = {
+        i: how.key("behind", ranking.by, over_sigmas, scores.keys, of_best.keys)
+        for i, (row, scores) in enumerate(rivals)
+        if row is not best
+    }
+    margins: dict[str, Floats] = {}
+    for i, key in keys.items():
+        if not answers.has(key):
+            first, second = _paired(rivals[i][1], of_best, ranking, over_sigmas)
+            answers.put(key, None)
             if first.size:
-                differences = first.mean(axis=0) - second.mean(axis=0)
-                [margins] = bootstrap.means(differences[None])
-                known[i] = bootstrap.compare(differences, 0.0, margins, 0.0)
+                margins[key] = first.mean(axis=0) - second.mean(axis=0)
+    for key, difference in zip(margins, differences([*margins.values()], how)):
+        answers.put(key, plain(difference))
+    known = {i: difference_of(answers[key]) for i, key in keys.items() if answers[key] is not None}
     corrected = dict(zip(known, holm([difference.p for difference in known.values()])))
     name = best.run, best.forecaster
     return [
@@ -271,10 +437,11 @@ def rankings_of(scores: Sequence[Scores]) -> dict[tuple[str, ...], Ranking]:
     return {group: Ranking.of(some) for group, some in replays.items()}
 
 
-def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator[SummaryRow]:
+def _rows(
+    scores: Scores, hold: Scores | None, how: Resamples, answers: Answers
+) -> Iterator[SummaryRow]:
     setting, metadata, sigmas = scores.setting, scores.source.metadata, scores.setting.world.sigmas
-    departures = sum(about["approximate_outputs"] for about in scores.about)
-    calls = sum(about["calls"] for about in scores.about)
+    departures, calls = scores.departures, scores.calls
     frames = scores.once["world_frames"]
     row = SummaryRow(
         trace=setting.trace.label,
@@ -292,12 +459,12 @@ def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator
         forecaster=scores.forecaster,
         sequences=len(scores.sequences),
         repetitions=len(scores.repeated["auc"]),
-        engine=scores.about[0]["engine"],
+        engine=scores.engine,
         exact=departures == 0,
         approximate_share=departures / calls if calls else 0.0,
         elapsed_ms=_mean(scores.once["elapsed_ms"]),
         init_ms=float(scores.once["init_ms"].mean()),
-        init_source=scores.about[0]["init_source"],
+        init_source=scores.init_source,
         skip_rate=float(1 - scores.once["processed"].sum() / frames.sum()),
         sigma=MEAN,
         scores={},
@@ -308,17 +475,17 @@ def _rows(scores: Scores, hold: Scores | None, bootstrap: Bootstrap) -> Iterator
             row,
             sigma=sigma,
             scores={metric: _mean(scores.means[metric][:, s]) for metric in METRICS},
-            uncertainty=_uncertainty(scores, hold, bootstrap, over_sigmas=False) if s == 0 else {},
+            uncertainty=_uncertainty(_key(scores, hold, False, how), answers) if s == 0 else {},
             staleness=_staleness(scores, s),
             modelled=_modelled(scores, [s], "first" if s == 0 else None),
         )
-    if set(SIGMA_GRID) <= set(sigmas):
+    if _has_grid(sigmas):
         grid = [s for s, sigma in enumerate(sigmas) if sigma in SIGMA_GRID]
         whole = len(grid) == len(sigmas)
         yield replace(
             row,
             scores={metric: _mean_of_means(scores.means[metric][:, grid]) for metric in METRICS},
-            uncertainty=_uncertainty(scores, hold, bootstrap, over_sigmas=True) if whole else {},
+            uncertainty=_uncertainty(_key(scores, hold, True, how), answers) if whole else {},
             modelled=_modelled(scores, grid, "mean" if whole else None),
         )
 
@@ -329,32 +496,56 @@ def _modelled(scores: Scores, at: Sequence[int], draws: str | None) -> Modelled 
     Args:
         scores: of all sequences and repetitions.
         at: indices of the sigmas.
-        draws: which joint draws of the cells make the intervals; None for none.
+        draws: which intervals belong to it; None for none.
     """
-    cells = [each["modelled"] for each in scores.about if each["modelled"]]
-    if not cells:
+    if scores.known is None:
         return None
     means = {m: _mean_of_means(scores.means[f"modelled_{m}"][:, at]) for m in MODELLED}
-    intervals = {}
-    for metric in MODELLED if draws is not None else ():
-        runs = summed([np.array(cell[draws][metric]) for cell in cells])
-        # of one sequence, what is drawn and what is unexplained are the same in all repetitions
-        each = runs[:, None, :, None] / sum(about["repetitions"] for about in scores.about)
-        rest = max(cell["unexplained"][metric] for cell in cells)
-        low, high = interval(each, cells[0]["known"], rest, scores.modelled_sequences)
-        if np.isfinite(low).all():
-            # in whatever chunks repetitions are dealt out, whose sums differ in the last bits
-            intervals[metric] = Interval(*(round(end.item(), 12) for end in (low, high)))
     outputs = scores.once["processed"]
     lost = float(scores.once["lost_share"] @ outputs / outputs.sum())
-    return Modelled(cells[0]["known"], lost, means, intervals)
+    return Modelled(scores.known, lost, means, scores.intervals.get(draws or "", {}))
 
 
-def _uncertainty(
-    scores: Scores, hold: Scores | None, bootstrap: Bootstrap, over_sigmas: bool
-) -> dict[str, Uncertainty]:
-    """How sure mean AUC and DP are, and what is won over hold; those of a known reach too."""
-    uncertain = {}
+def _resample(
+    all_scores: Iterable[tuple[Scores, Scores | None]],
+    how: Resamples,
+    answers: Answers,
+    run: RunAll,
+) -> None:
+    """Add the answers that are missing: how sure the means of scores are, beside hold's."""
+    missing = {
+        key: (scores, hold, over_sigmas)
+        for scores, hold in all_scores
+        for over_sigmas in (False, True)[: 1 + _is_whole_grid(scores.setting.world.sigmas)]
+        if not answers.has(key := _key(scores, hold, over_sigmas, how))
+    }
+    few = sum(len(scores.sequences) + _AS_DEAR for scores, _, _ in missing.values()) < FEW
+    asked = ((key, _samples(*each)) for key, each in missing.items())
+    pieces = iter(lambda: [*islice(asked, _PIECE)], [])
+    work = partial(_resampled, how=how)
+    with closing((run_here if few else run)(work, pieces)) as found:
+        for piece, of_piece in found:
+            for (key, _), answer in zip(piece, of_piece):
+                answers.put(key, answer)
+
+
+def _resampled(
+    piece: Sequence[tuple[str, Mapping[str, Sample]]], how: Resamples
+) -> list[dict[str, Any]]:
+    """The answers to a piece, by metric."""
+    found = iter(uncertainties([each for _, some in piece for each in some.values()], how))
+    return [{metric: plain(next(found)) for metric in some} for _, some in piece]
+
+
+def _key(scores: Scores, hold: Scores | None, over_sigmas: bool, how: Resamples) -> str:
+    """Digest of all that the answer depends on."""
+    base = None if hold is None or hold is scores else hold.keys
+    return how.key("mean", over_sigmas, scores.keys, base)
+
+
+def _samples(scores: Scores, hold: Scores | None, over_sigmas: bool) -> dict[str, Sample]:
+    """What is uncertain of AUC and DP; of those of a known reach too."""
+    samples = {}
     for metric in (*MODELLED, *(_MODELLED if scores.known else ())):
         values = scores.by_repetition(over_sigmas)[metric]
         base = None if hold is None or hold is scores else hold.by_repetition(over_sigmas)[metric]
@@ -363,21 +554,27 @@ def _uncertainty(
             kept &= ~np.isnan(base.mean(axis=0))
         if not kept.any():
             continue
-        mean = values[:, kept].mean(axis=0)
-        jitter = bootstrap.interval(values[:, kept].mean(axis=1)) if len(values) > 1 else None
         if base is None:
-            [means] = bootstrap.means(mean[None])
-            uncertain[metric] = Uncertainty(bootstrap.interval(means), jitter)
-            continue
-        offline = scores.once[f"offline_{metric.removeprefix('modelled_')}"][kept]
-        bare = base[:, kept].mean(axis=0)
-        means, held, losses = bootstrap.means(np.stack([mean, bare, offline - bare]))
-        difference, share = bootstrap.compare(mean, bare, means, held), None
-        if not np.isnan(offline).any():
-            lost = float(offline.mean() - bare.mean())
-            share = bootstrap.recover(difference.value, lost, means - held, losses)
-        uncertain[metric] = Uncertainty(bootstrap.interval(means), jitter, difference, share)
-    return uncertain
+            samples[metric] = Sample(values[:, kept])
+        else:
+            offline = scores.once[f"offline_{metric.removeprefix('modelled_')}"][kept]
+            samples[metric] = Sample(values[:, kept], base[:, kept].mean(axis=0), offline)
+    return samples
+
+
+def _uncertainty(key: str, answers: Answers) -> dict[str, Uncertainty]:
+    """How sure mean AUC and DP are, and what is won over hold; those of a known reach too."""
+    return {metric: uncertainty_of(answer) for metric, answer in answers[key].items()}
+
+
+def _is_whole_grid(sigmas: Sequence[Fraction]) -> bool:
+    """Whether the sigmas are those of the grid, so that means over them are uncertain too."""
+    return _has_grid(sigmas) and set(sigmas) == set(SIGMA_GRID)
+
+
+def _has_grid(sigmas: Sequence[Fraction]) -> bool:
+    """Whether all sigmas of the grid are among some."""
+    return len(sigmas) >= len(SIGMA_GRID) and set(SIGMA_GRID) <= set(sigmas)
 
 
 def _staleness(scores: Scores, s: int) -> Staleness:

@@ -16,7 +16,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.files import written_whole
 from lae_sim.replay.latency import bootstrap, lognormal, resampled
-from lae_sim.replay.world import _LATENCIES, _POLICIES, parse_latency, parse_policy
+from lae_sim.replay.names import LATENCIES, POLICIES, parse_latency, parse_policy
 
 RECORDING = lae_sim.Recording.new(
     "sequence", [[0, 0, 1, 1]] * 4, [[0, 0, 1, 1]] * 4, [90_000_000, 40_000_000, 30_000_000, 2]
@@ -167,7 +167,7 @@ def test_the_help_of_replay_explains_every_policy_latency_and_convention(capsys)
     with pytest.raises(SystemExit):
         main(["replay", "--help"])
     printed = capsys.readouterr().out
-    for name in (*_POLICIES, *_LATENCIES, *lae_sim.CONVENTIONS):
+    for name in (*POLICIES, *LATENCIES, *lae_sim.CONVENTIONS):
         assert re.search(rf"^  {name}\b.* {{2}}\w.+|; {name}: \w+", printed, re.M), name
 
 

@@ -595,7 +595,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     tmp_path, monkeypatch, capsys
 ):
     calls = Counter()
-    for function in (lanes.simulate_lanes, pairing.pair, base.forecast):
+    for function in (lanes.simulate_many, pairing.pair, base.forecast):
         name = function.__name__
 
         def counted(*arguments, _function=function, _name=name, **named):
@@ -610,7 +610,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     assert replay_command.main(asked) == 0
     plain, alone = capsys.readouterr().out, calls.copy()
     # one group of sequences: one schedule, a pairing for each cost, and each forecaster once
-    assert alone == {"simulate_lanes": 1, "pair": 2, "forecast": 2}
+    assert alone == {"simulate_many": 1, "pair": 2, "forecast": 2}
     calls.clear()
     files = {
         "--plot": "plot.svg",
@@ -629,7 +629,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     calls.clear()
     timeline = ["--timeline", str(tmp_path / "timeline.svg"), "--search", "off"]
     assert replay_command.main([str(SLOW), *timeline]) == 0
-    assert calls == {"simulate_lanes": 1, "pair": 1, "forecast": 2}
+    assert calls == {"simulate_many": 1, "pair": 1, "forecast": 2}
 
 
 def test_a_fast_tracker_is_told_of_the_floor_of_one_frame():
@@ -642,3 +642,61 @@ def test_a_fast_tracker_is_told_of_the_floor_of_one_frame():
     assert "floor" not in replay(FAST, "--policy", "vot-realtime")
     for result in replay_json(FAST, "--latency", "constant:1ns")["traces"][0]["results"]:
         assert 0.99 < result["mismatch_mean"] < 1  # all but frame 0's answer, on time
+
+
+DRONE = """
+[camera]
+delivery = "5ms"
+drops = "every:10"
+[resources]
+gpu = 1
+[[stages]]
+name = "decode"
+time = "6ms"
+resource = "gpu"
+[[stages]]
+name = "tracker"
+time = "20ms"
+resource = "gpu"
+"""
+
+
+def test_a_pipeline_is_replayed_and_told_of(tmp_path):
+    drone = tmp_path / "drone.toml"
+    drone.write_text(DRONE)
+    printed = replay(FAST, "--pipeline", str(drone), "--sequence", "boat-calm")
+    assert "policy pipeline:drone, latency constant:20ms" in printed
+    assert (
+        "drone: the camera lost 30 of 300 frames and delivered the others after 5.0 ms" in printed
+    )
+    assert "decode   " in printed
+    assert "resource gpu: in use 7" in printed
+    (report,) = json.loads(
+        replay(FAST, "--pipeline", str(drone), "--sequence", "boat-calm", "--json")
+    )["traces"]
+    assert report["pipeline"]["camera"]["lost"] == 30
+    assert report["results"][0]["capture_age_ms"] > report["results"][0]["age_ms"]
+
+
+def test_several_pipelines_stand_side_by_side(tmp_path):
+    for name, queue in (("one", 1), ("ten", 10)):
+        stage = f'[[stages]]\nname = "tracker"\ntime = "47ms"\nqueue = {queue}\n'
+        (tmp_path / f"{name}.toml").write_text(stage)
+    files = [str(tmp_path / f"{name}.toml") for name in ("one", "ten")]
+    printed = replay(FAST, "--pipeline", *files, "--sequence", "boat-calm")
+    assert printed.splitlines()[0].split()[:3] == ["trace", "forecaster", "pipeline"]
+    assert "pipeline:ten" in printed.split("\n\n")[0]
+
+
+def test_a_pipeline_s_mistakes_name_file_stage_and_key(tmp_path):
+    drone = tmp_path / "drone.toml"
+    drone.write_text(DRONE.replace('"6ms"', '"6"'))
+    done = run_here("replay", FAST, "--pipeline", drone)
+    assert done.returncode == 2
+    assert f"{drone}: stage 'decode': time: no latency '6'" in done.stderr
+    drone.write_text(DRONE)
+    done = run_here("replay", FAST, "--pipeline", drone, "--policy", "fifo")
+    assert "fifo does not go with a pipeline" in done.stderr
+    done = run_here("replay", FAST, "--pipeline", drone, "--plot", drone)
+    assert done.returncode == 2
+    assert drone.read_text() == DRONE

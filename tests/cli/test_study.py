@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -25,6 +25,7 @@ from restarted import gap_pass
 import lae_sim
 from lae_sim.cli.study import main
 from lae_sim.comparison.forecasters import score_forecasters
+from lae_sim.comparison.pairs import Pairs
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import evaluate_runs
 from lae_sim.forecast.learned import write_learned
@@ -33,7 +34,6 @@ from lae_sim.replay.latency import bootstrap, by_frame, constant, scaled
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study import rows as cell_rows
 from lae_sim.study.comparisons import Rivals
-from lae_sim.study.pairs import Pairs
 from lae_sim.study.run import StudyResults, compute_study, flat_rows
 from lae_sim.study.spec import Study
 
@@ -648,6 +648,87 @@ def test_pairs_are_kept_and_only_those_of_others_are_compared(
     assert compared == ["hold", "constant-velocity", "kalman"]
 
 
+def test_what_was_resampled_is_kept_until_something_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lae_sim.study import summary, uncertainty
+
+    mine, out = tmp_path / "mine.parquet", tmp_path / "out"
+    shutil.copy(SLOW, mine)
+    study = Study((str(mine), str(FAST)), sequences=FEW)
+    first = run(out, study)
+    before = contents(out)
+    asked: list[str] = []
+
+    def counted(kind: str) -> Callable[..., Any]:
+        answered = getattr(uncertainty, kind)
+
+        def count(some: Sequence[Any], how: Any) -> Any:
+            asked.extend([kind] * len(some))
+            return answered(some, how)
+
+        return count
+
+    def asked_now(study: Study) -> dict[str, int]:
+        asked.clear()
+        results = run(out, study)
+        there = {kind: asked.count(kind) for kind in ("uncertainties", "differences")}
+        assert results.summary == tuple(summary.summarise_study(results.scores, study.seed))
+        return there
+
+    for kind in ("uncertainties", "differences"):
+        monkeypatch.setattr(summary, kind, counted(kind))
+    none, everything = (dict(zip(("uncertainties", "differences"), n)) for n in ((0, 0), (8, 3)))
+    again = run(out, study)
+    assert (asked, again.summary, contents(out)) == ([], first.summary, before)
+    assert asked_now(replace(study, seed=1)) == everything  # of 4 cells AUC and DP; of 3 worse
+    assert asked_now(study) == everything  # the last study's are kept, no others
+    assert asked_now(replace(study, conventions=("pysot", "otb"))) == everything  # of the new one
+    assert asked_now(study) == none
+    _edited(out / "about" / "answers.json")
+    assert asked_now(study) == everything
+    kept = "about/answers.json"
+    assert contents(out)[kept] == before[kept]
+    shutil.copy(FAST, mine)
+    assert asked_now(study)["uncertainties"] == 4
+    answers = uncertainty.Answers()
+    for resamples, more in ((10, 8), (10, 0), (11, 8)):
+        asked.clear()
+        summary.summarise_study(first.scores, resamples=resamples, answers=answers)
+        assert asked.count("uncertainties") == more
+
+
+def test_the_summary_of_a_finished_study_is_not_written_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = Study((str(SLOW), str(FAST)), sequences=FEW)
+    first = run(tmp_path, study)
+    before = contents(tmp_path)
+    written: list[str] = []
+    write = lae_sim.study.run.write_csv
+    monkeypatch.setattr(
+        "lae_sim.study.run.write_csv",
+        lambda records, path: (written.append(path.name), write(records, path)),
+    )
+    again = run(tmp_path, study)
+    assert (written, contents(tmp_path)) == ([], before)
+    assert list(again.traces) == list(first.traces) == again.traces[:]
+    assert len(again.traces) == 2
+    both = ["summary.csv", "comparisons.csv"]
+    for damage in (Path.unlink, _edited):
+        for name in ("summary.csv", "study.json"):
+            damage(tmp_path / name)
+            run(tmp_path, study)
+            assert (written, contents(tmp_path)) == (both, before)
+            written.clear()
+    (tmp_path / "required.csv").write_text("of another study")
+    run(tmp_path, study)
+    assert (written, contents(tmp_path)) == (both, before)
+    run(tmp_path, replace(study, seed=1))
+    assert written == both * 2
+    assert contents(tmp_path)["study.json"] != before["study.json"]
+
+
 def test_of_many_pairs_those_with_the_best_are_held(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -901,10 +982,12 @@ def test_a_trace_that_changes_meanwhile_is_not_taken_for_what_it_was(tmp_path: P
             shutil.copy(SLOW, mine)
 
     study = Study((str(mine),), sequences=FEW, scales=(Fraction(1), Fraction(2)))
-    with pytest.raises(LaeError, match="changed since the study began"):
-        compute_study(study, tmp_path / "out", workers=1, progress=progress)
+    found = compute_study(study, tmp_path / "out", workers=1, progress=progress)
+    assert found.computed == 2  # with the description of the trace, which is read for both
+    assert ["changed since the study began" in each.reason for each in found.failures] == [True]
+    assert {row.scale for row in found.summary} == {Fraction(1)}
     shutil.copy(FAST, mine)
-    assert run(tmp_path / "out", study).computed == 4
+    assert run(tmp_path / "out", study).computed == 2
 
 
 def test_files_of_alike_names_keep_apart(tmp_path: Path) -> None:

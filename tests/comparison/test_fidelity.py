@@ -23,7 +23,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.scheduler import simulate
 from lae_sim.errors import LaeError
 from lae_sim.forecast.kalman import Kalman
-from lae_sim.replay.world import parse_policy
+from lae_sim.replay.names import parse_policy
 from lae_sim.trace.file import Trace, read_trace, write_trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording

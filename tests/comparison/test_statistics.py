@@ -387,13 +387,14 @@ def test_a_difference_is_paired():
     bootstrap = Bootstrap(resamples=300)
     values, baseline = np.array([0.5, 0.6, 0.7, 0.4]), np.array([0.4, 0.6, 0.5, 0.5])
     means, others = bootstrap.means(np.stack([values, baseline]))
-    found = bootstrap.compare(values, baseline, means, others)
+    [found] = bootstrap.differences(values[None], baseline[None], [means], [others])
     assert found.value == pytest.approx(0.05)
     assert (found.better, found.worse) == (2, 1)
     assert found.p == signed_rank_p(np.array([0.1, 0.2, -0.1]))
     assert found.interval == bootstrap.interval(means - others)
     [margins] = bootstrap.means((values - baseline)[None])
-    alike = bootstrap.compare(values - baseline, 0.0, margins, 0.0)
+    one = (values - baseline)[None]
+    [alike] = bootstrap.differences(one, np.zeros_like(one), [margins], [0.0])
     assert (alike.p, alike.better, alike.worse) == (found.p, found.better, found.worse)
     assert alike.interval.low == pytest.approx(found.interval.low, abs=1e-12)
 

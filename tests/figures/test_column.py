@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from itertools import combinations
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,8 +11,8 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lae_sim.figures.column import COLUMN, column_figure, field_score, write_column_figure
-from lae_sim.figures.lines import Curve, Line, Panel, curves_in_column, panel_in_column
+from lae_sim.figures.column import COLUMN, column_figure, column_files, field_score
+from lae_sim.figures.lines import Curve, Line, Panel, panel_in_column, panels_of
 from lae_sim.figures.style import forecaster_styles, paper_styles
 from lae_sim.learning.registry import BUILT_IN
 
@@ -38,7 +37,7 @@ def sizes(figure: Figure) -> set[float]:
 
 
 def test_a_figure_fits_a_column_and_has_no_title() -> None:
-    for figure in curves_in_column(curves()):
+    for figure in map(panel_in_column, panels_of(curves())):
         assert figure.get_figwidth() == COLUMN == 3.4
         assert 1.5 < figure.get_figheight() < 3
         assert sizes(figure) == {7.5, 8}
@@ -58,7 +57,7 @@ def test_a_title_is_left_out() -> None:
 
 
 def test_legends_hold_scores_as_papers_write_them_the_best_first() -> None:
-    success, precision = curves_in_column(curves())
+    success, precision = map(panel_in_column, panels_of(curves()))
     texts = [[text.get_text() for text in f.legends[0].get_texts()] for f in (success, precision)]
     assert texts[0] == ["offline [.700]", "kalman [.600]", "hold [.500]"]
     assert texts[1] == ["offline [.280]", "kalman [.240]", "hold [.200]"]
@@ -92,15 +91,11 @@ def test_many_points_have_few_markers_not_above_each_other() -> None:
     assert all(line.get_marker() not in ("", "None") for line in axes.lines)
 
 
-def test_files_are_the_same_bytes_and_hold_their_fonts(tmp_path: Path) -> None:
-    written = []
-    for name in ("one", "two"):
-        folder = tmp_path / name
-        folder.mkdir()
-        pdf, svg = write_column_figure(curves_in_column(curves())[0], folder, "success")
-        written.append((pdf.read_bytes(), svg.read_bytes()))
-    assert written[0] == written[1]
-    pdf_bytes, svg_bytes = written[0]
+def test_files_are_the_same_bytes_and_hold_their_fonts() -> None:
+    success, _ = panels_of(curves())
+    files, again = (column_files(panel_in_column(success)) for _ in range(2))
+    assert files == again
+    pdf_bytes, svg_bytes = files["pdf"], files["svg"]
     assert b"/FontFile2" in pdf_bytes  # TrueType, embedded
     assert b"/Type3" not in pdf_bytes
     assert b"CreationDate" not in pdf_bytes
@@ -112,10 +107,9 @@ def test_files_are_the_same_bytes_and_hold_their_fonts(tmp_path: Path) -> None:
     assert b"<dc:date>" not in svg_bytes
 
 
-def test_names_in_any_letters_are_drawn(tmp_path: Path) -> None:
+def test_names_in_any_letters_are_drawn() -> None:
     def draw(axes: Axes) -> None:
         axes.plot([0, 1], label="追踪 $x^2_")
         axes.plot([1, 0], label="a_b\x00")
 
-    paths = write_column_figure(column_figure(draw), tmp_path, "names")
-    assert [path.suffix for path in paths] == [".pdf", ".svg"]
+    assert [*column_files(column_figure(draw))] == ["pdf", "svg"]

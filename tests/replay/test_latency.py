@@ -33,8 +33,9 @@ from lae_sim.replay.latency import (
     resampled,
     scaled,
 )
+from lae_sim.replay.names import label_of, parse_latency
 from lae_sim.replay.run import replay_sequence
-from lae_sim.replay.world import World, label_of, parse_latency, replay_trace
+from lae_sim.replay.world import World, replay_trace
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording

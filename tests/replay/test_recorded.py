@@ -13,9 +13,10 @@ from lae_sim.engine.policies import every, fifo, latest
 from lae_sim.engine.scheduler import Policy, simulate
 from lae_sim.errors import LaeError
 from lae_sim.replay.latency import scaled
+from lae_sim.replay.names import parse_policy
 from lae_sim.replay.recorded import AsRecorded
 from lae_sim.replay.run import Runs, replay_sequence
-from lae_sim.replay.world import World, parse_policy
+from lae_sim.replay.world import World
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording

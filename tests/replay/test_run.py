@@ -26,11 +26,19 @@ from lae_sim.replay.latency import (
     resampled,
     scaled,
 )
-from lae_sim.replay.run import Run, Runs, replay_repeated, replay_sequence
+from lae_sim.replay.run import (
+    Repetitions,
+    Run,
+    Runs,
+    grouped,
+    replay_repeated,
+    replay_sequence,
+    replay_together,
+)
 from lae_sim.replay.world import replay_trace
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
-from lae_sim.trace.recording import Recording
+from lae_sim.trace.recording import BESIDE, Recording, batched
 
 NAMES = [f"s{i:02}" for i in range(12)]
 EVERY = Metadata.new("30", "every-frame")
@@ -77,6 +85,21 @@ def test_a_batch_gives_the_same_runs(source: LatencySource, policy: Policy) -> N
     for options in ({}, {"timing": SLOWER}, {"passes": [half]}, {"fps": Fraction(30000, 1001)}):
         runs = replay_trace(TRACE, latency=source, policy=policy, **options)  # type: ignore[arg-type]
         assert [fields(r) for r in runs] == [fields(r) for r in in_simpy(runs)]
+
+
+@pytest.mark.usefixtures("groups")
+def test_replays_together_are_what_they_are_alone() -> None:
+    replays = [
+        replay_trace(TRACE),
+        replay_trace(SLOWER, latency=constant(ns=47_000_000)),
+        replay_trace(TRACE, fps=Fraction(25)),
+        replay_trace(TRACE, policy=every(2)),
+        replay_trace(TRACE, latency=lambda recording: by_frame(recording).__call__),
+    ]
+    alone = [(k, fields(run)) for k, runs in enumerate(replays) for run in in_simpy(runs)]
+    for frames in (1, 200, 10**6):
+        together = replay_together(replays, frames)
+        assert [(k, fields(run)) for k, batch in together for run in batch] == alone
 
 
 def in_simpy(runs: Runs) -> Iterator[Run]:
@@ -157,3 +180,19 @@ def test_repetitions_come_one_after_another() -> None:
     assert list(replay_repeated(runs, 0)) == []
     with pytest.raises(LaeError, match="only random times can be drawn again"):
         next(replay_repeated(replay_trace(TRACE), 2))
+
+
+@pytest.mark.parametrize("frames", [1, 90, 150, 10**6])
+@pytest.mark.parametrize("lane_frames", [1, 700, 1 << 21])
+def test_batches_are_grouped_as_runs_are(
+    frames: int, lane_frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "_LANE_FRAMES", lane_frames)
+    repeated = Repetitions(replay_trace(TRACE, latency=bootstrap(7)), 3, 2)
+    found = list(grouped(repeated, frames))
+    expected = list(batched(list(repeated), frames, BESIDE))
+    assert [[fields(each) for each in batch] for batch in found] == [
+        [fields(each) for each in group] for group in expected
+    ]
+    drawn = [r for batch in found for r in batch.repetition.tolist()]
+    assert drawn == [r for r, _ in replay_repeated(repeated.runs, 3, 2)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -11,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lae_sim.errors import LaeError
-from lae_sim.figures.column import ColumnFigure, column_figure
+from lae_sim.figures.column import ColumnFigure, DrawnFigure, column_figure, drawn
 from lae_sim.report.latex import latex_of
 from lae_sim.report.paper import (
     MOST_ROWS,
@@ -31,9 +32,9 @@ TABLE = Table.of([Column("name", "name", is_label=True), Column("AUC", "auc", SC
 TABLES = [PaperTable(TABLE, TABLE, TABLE)]
 
 
-def figures(*names: str) -> Iterator[ColumnFigure]:
-    for name in names:
-        yield ColumnFigure(name, f"of {name}", column_figure(lambda axes: axes.plot([0, 1])))
+def figures(*names: str) -> Iterator[DrawnFigure]:
+    draw = partial(column_figure, lambda axes: axes.plot([0, 1]))
+    return (drawn(ColumnFigure(name, f"of {name}", draw)) for name in names)
 
 
 def files_in(folder: Path) -> set[str]:
@@ -71,7 +72,7 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
     write_paper(Paper(figures("one"), TABLES), tmp_path)
     before = {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)}
 
-    def breaks() -> Iterator[ColumnFigure]:
+    def breaks() -> Iterator[DrawnFigure]:
         yield from figures("one", "two")
         raise LaeError("broken")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import html
+import pickle
 import re
 from fractions import Fraction
 
@@ -12,10 +13,20 @@ import pytest
 from nasty import nasty_traces
 
 from lae_sim.errors import visible
-from lae_sim.figures.study import Point, _front, _gains, front
+from lae_sim.figures.study import (
+    MOST_NAMED,
+    Point,
+    _draw_fronts,
+    _fronts,
+    front,
+    gains,
+    study_in_columns,
+    sweep,
+)
+from lae_sim.figures.style import GREY
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.latex import latex_of
-from lae_sim.report.page import page
+from lae_sim.report.page import page, page_drawings, page_sections
 from lae_sim.report.study_tables import (
     comparison_table,
     ranking,
@@ -196,11 +207,8 @@ def test_pictures_over_sigma_are_called_mauc(over_grid, results):
     for study, name in ((over_grid, "mAUC"), (results, "AUC")):
         view = View(study)
         assert front(view).caption.startswith(f"{name} against")
-        figure = _front(
-            view, [Point(row, row.elapsed_ms, row.score("auc")) for row in view.standing]
-        )
-        assert {axes.get_ylabel() for axes in figure.axes} == {name}
-        figure = _gains(view, view.standing, [run_of(row) for row in view.standing])
+        assert {axes.get_ylabel() for axes in front(view).draw().axes} == {name}
+        figure = gains(view).draw()
         assert figure.axes[0].get_xlabel() == f"{name} won over hold"
 
 
@@ -213,9 +221,69 @@ def test_the_front_names_each_tracker_beside_its_best_point(results):
         for run, ms, auc in (*held, *best)
     ]
     view.__dict__["names"] = {run: run for run, _, _ in best}
-    [axes] = _front(view, points).axes
+    [axes] = _draw_fronts(_fronts(view, points)).axes
     labels = {text.get_text(): text.xy for text in axes.texts}
     assert labels == {run: (ms, auc) for run, ms, auc in best}
+
+
+def test_of_many_trackers_the_front_names_the_best_and_shows_the_others_in_grey(results):
+    view, [row, *_] = View(results), results.summary
+    ends = {f"T{i}": (10 + i, i / 50, i in (3, 30)) for i in range(40)}
+    points = [
+        Point(dataclasses.replace(row, trace=run, times_from=run, pareto=is_best), ms, auc)
+        for run, (ms, auc, is_best) in ends.items()
+    ]
+    view.__dict__["names"] = {run: run for run in ends}
+    [axes] = _draw_fronts(_fronts(view, points)).axes
+    named = {text.get_text() for text in axes.texts}
+    assert named == {"T3", *(f"T{i}" for i in range(39, 40 - MOST_NAMED, -1))}
+    [others] = [line for line in axes.lines if len(line.get_xdata()) == 40 - MOST_NAMED]
+    assert others.get_color() == GREY
+    assert set(others.get_xdata()) == {ms for run, (ms, *_) in ends.items() if run not in named}
+
+
+def test_of_many_datasets_a_few_are_drawn_and_the_captions_say_so(results):
+    many = tuple(
+        dataclasses.replace(row, trace=f"T{i}", times_from=f"T{i}", dataset=f"D{i}")
+        for i in range(20)
+        for row in results.summary
+    )
+    view = View(dataclasses.replace(results, summary=many))
+    drawing = front(view)
+    assert "; the first 3 of 20 datasets" in drawing.caption
+    assert [axes.get_title() for axes in drawing.draw().axes] == ["D0", "D1", "D2"]
+    over_scale = sweep(view, "scale")
+    assert "; the first 3 of 20 datasets" in over_scale.caption
+    assert len(over_scale.draw().axes) == 2 * 3
+    assert front(View(results)).caption.count("datasets") == 0
+
+
+def test_gains_are_where_the_summary_has_them(results):
+    rows = {run_of(row): row for row in View(results).standing if row.forecaster == "kalman"}
+    won, recovered = gains(View(results)).draw().axes
+    assert recovered.get_xlabel() == "latency loss recovered (%)"
+    [names] = {tuple(label.get_text() for label in won.get_yticklabels())}
+    [dots] = [line for line in won.lines if line.get_label() == "kalman"]
+    [ends] = [each.get_segments() for each in won.collections]
+    assert len(names) == len(dots.get_xdata()) == len(ends) == len(rows) == 2
+    for x, segment in zip(dots.get_xdata(), ends):
+        [gain] = [r.certainty("auc").vs_hold for r in rows.values()
+                  if r.certainty("auc").vs_hold.value == x]  # fmt: skip
+        assert segment[:, 0].tolist() == [gain.interval.low, gain.interval.high]
+
+
+def test_what_is_drawn_can_go_to_workers(results):
+    view = View(results)
+    for figure in study_in_columns(view):
+        assert len(pickle.dumps(figure)) < 20_000
+    drawings = page_drawings(page_sections(view))
+    text = page(view)
+    for draw in drawings.values():
+        assert len(pickle.dumps(draw)) < 50_000
+    name, draw = next(iter(drawings.items()))
+    picture = pickle.loads(pickle.dumps(draw))()
+    assert name.startswith("curves-")
+    assert picture in text
 
 
 def test_what_is_said_of_all_traces_is_said_once(results):

@@ -25,6 +25,7 @@ from lae_sim.study.records import (
     Uncertainty,
 )
 from lae_sim.study.summary import Scores, _behind
+from lae_sim.study.uncertainty import Answers, Resamples
 from lae_sim.study.verdict import (
     LEVEL,
     MOST_REQUIRED,
@@ -59,11 +60,12 @@ def setting(pairs: Mapping[tuple[str, str], Sequence[float]], **values: Any) -> 
         )  # fmt: skip
         rows.append(dataclasses.replace(row, **values))
         one = SimpleNamespace(
+            keys=(tracker, forecaster, *by_sequence),
             sequences=tuple(map(str, range(len(auc)))),
             by_repetition=lambda over_sigmas, auc=auc: {"auc": auc[None]},
         )
         scores.append(cast(Scores, one))
-    behind = _behind(list(zip(rows, scores)), RECORDED, BOOTSTRAP)
+    behind = _behind(list(zip(rows, scores)), RECORDED, Resamples(0, 200), Answers())
     return [dataclasses.replace(row, behind=each) for row, each in zip(rows, behind)]
 
 

@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from lae_sim.comparison import pairs
+from lae_sim.comparison.pairs import Member, pairs_of, superiority
 from lae_sim.comparison.statistics import Bootstrap, holm
-from lae_sim.study import pairs
-from lae_sim.study.pairs import Member, pairs_of, superiority
 
 RNG = np.random.default_rng(7)
 RESAMPLES = 500
@@ -46,7 +46,7 @@ def pair(a: Member, b: Member, seed: int):
         return None
     differences = one.mean(axis=0) - other.mean(axis=0)
     [margins] = bootstrap.means(differences[None])
-    found = bootstrap.compare(differences, 0.0, margins, 0.0)
+    [found] = bootstrap.differences(differences[None], 0 * differences[None], [margins], [0.0])
     here = np.nan
     if len(one) > 1 or len(other) > 1:
         margins = drawn_margins(one, other, bootstrap)
