@@ -155,16 +155,8 @@ def staged(columns: Columns, *changes: tuple[int, Any]) -> Columns:
 def logged() -> Columns:
     """A real-time run whose frames queued: what waiting and the calls took."""
     columns = skipping()
-    waited = [
-        0,
-        None,
-        4_000_000,
-        None,
-        0,
-        None,
-        0,
-        0,
-    ]  # a call of ``a`` began before the last ended
+    # of ``a`` a call began before the last had ended
+    waited = [0, None, 4_000_000, None, 0, None, 0, 0]
     calls = [
         None if ns is None or wait is None else ns - wait
         for ns, wait in zip(columns["elapsed_ns"], waited)

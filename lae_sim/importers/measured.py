@@ -224,7 +224,7 @@ def convert_log(
         fps=rate,
         tracker=tracker,
         dataset=dataset or name,
-        timing=timing,
+        timing={name: timing[name] for name in ("source", "note")},
         sequences=1,
         frames=len(recording),
         processed=len(processed),
