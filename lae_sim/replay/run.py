@@ -730,11 +730,11 @@ def _replayed(
 
 
 def _as_recorded(
-    jobs: Sequence[_Job], services: Sequence[Service], policy: AsRecorded
+    jobs: Sequence[_Job], services: Sequence[Service], policy: Policy
 ) -> Iterator[Schedules]:
     """The schedules of sequences that have rules of their own, one by one."""
     for job, service in zip(jobs, services):
-        yield Schedules.of([simulate(len(job), job.clock, service, policy.of(job.times))])
+        yield Schedules.of([simulate(len(job), job.clock, service, _rule(policy, job))])
 
 
 def _rule(policy: Policy, job: _Job) -> Policy:

@@ -128,6 +128,24 @@ def test_outputs_out_of_order_are_left_out(tmp_path: Path) -> None:
     assert left in summary.notes
 
 
+def test_an_output_that_begins_as_the_stream_ends_is_left_out(tmp_path: Path) -> None:
+    outputs = {0: (None, 60 * MS), 1: (None, 61 * MS)}  # at 20 frames/s it ends at 10 + 50 ms
+    trace, summary = convert_log(written(tmp_path, rows_of([0, 10 * MS], outputs)), fps=20)
+    assert replayed(trace) == {0: 60 * MS}
+    assert "1 outputs that began after the stream had ended are left out" in summary.notes
+    outputs[0] = None, 60 * MS - 1
+    trace, _ = convert_log(written(tmp_path, rows_of([0, 10 * MS], outputs)), fps=20)
+    assert replayed(trace) == {0: 60 * MS - 1, 1: 61 * MS}
+
+
+def test_the_first_output_may_be_of_a_later_frame(tmp_path: Path) -> None:
+    outputs = {0: (None, 60 * MS), 1: (None, 30 * MS), 2: (None, 70 * MS)}
+    rows = rows_of([0, 10 * MS, 20 * MS], outputs)
+    trace, summary = convert_log(written(tmp_path, rows), fps=20)
+    assert replayed(trace) == {0: 20 * MS, 1: 60 * MS}  # frames 1 and 2
+    assert "1 outputs of frames that are left out" in summary.notes
+
+
 def test_the_initial_box(tmp_path: Path) -> None:
     arrived = [k * 33 * MS for k in range(6)]
     outputs = {2: (None, 90 * MS), 4: (None, 140 * MS)}

@@ -325,6 +325,7 @@ def test_boxes_that_are_stamped_later_than_their_frames(tmp_path: Path) -> None:
     recording, document, _ = converted(bag, match="20ms")
     assert np.flatnonzero(recording.elapsed_ns >= 0).tolist() == [0, 2, 3, 7]
     assert document["log"]["matched_by"] == "nearest earlier stamp, within 20ms"
+    assert len(converted(bag, match="12ms")[0]) == 9
     with pytest.raises(LaeError, match="4 of 4 messages"):
         convert_log(bag, match="11.999ms")
 

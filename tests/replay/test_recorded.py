@@ -83,6 +83,10 @@ def test_the_boxes_of_another_trace_at_a_log_s_schedule() -> None:
     run = replay_sequence(full, CLOCK, policy=AsRecorded(), times=log)
     own = replay_sequence(log, CLOCK, policy=AsRecorded())
     assert run.schedule.ready.tolist() == own.schedule.ready.tolist()
+    every_frame = Trace(Metadata.new("30", "every-frame"), [full])
+    timing = Trace(Metadata.new("30", "real-time", schedule={"policy": "recorded"}), [log])
+    [again] = World.of(policy="recorded", timing=timing).replay(every_frame)
+    assert again.schedule.frames.tolist() == own.schedule.frames.tolist()
     assert run.boxes.tolist() == full.boxes[run.schedule.frames].tolist()
 
 
