@@ -468,7 +468,7 @@ class _Timeline:
             free, last = ready, frame
             ready_ns.append(ready)
         counted = {
-            "outputs of frames that are left out": early,
+            "outputs from before the first frame are left out": early,
             "outputs of frames older than one whose output was ready are left out": overtaken,
             "outputs that began after the stream had ended are left out": late,
             "calls began before the one before was ready: their times reach from output to "

@@ -143,7 +143,7 @@ def test_the_first_output_may_be_of_a_later_frame(tmp_path: Path) -> None:
     rows = rows_of([0, 10 * MS, 20 * MS], outputs)
     trace, summary = convert_log(written(tmp_path, rows), fps=20)
     assert replayed(trace) == {0: 20 * MS, 1: 60 * MS}  # frames 1 and 2
-    assert "1 outputs of frames that are left out" in summary.notes
+    assert "1 outputs from before the first frame are left out" in summary.notes
 
 
 def test_the_initial_box(tmp_path: Path) -> None:
