@@ -422,26 +422,14 @@ class _Timeline:
         last, box = -1, init_box
         init_note = "the first output's time stands for that of the initialisation"
         for output in sorted(outputs, key=lambda output: (output.ready_ns, output.frame)):
-            frame, ready = output.frame - begin, output.ready_ns - zero
+            frame = output.frame - begin
             if frame < 0 or (frame > 0 and last < 0 and box is None):
                 early += 1
                 continue
             if (other := of_frame.setdefault(output.frame, output)) is not output:
                 raise LaeError(f"{output.where}: a second output of the frame of {other.where}")
-            here = arrived[output.frame] - zero
-            begun = None if output.started_ns is None else output.started_ns - zero
-            if min(ready, ready if begun is None else begun) < here:
-                what = "ready" if ready < here else "started"
-                by = here - (ready if ready < here else begun or 0)
-                raise LaeError(
-                    f"{output.where}: {what} {seconds(by)} before its frame arrived; if the log "
-                    "received the frame later than the tracker did, --arrivals captured takes the "
-                    "time of its capture"
-                )
-            if begun is not None and begun > ready:
-                raise LaeError(
-                    f"{output.where}: started {seconds(begun - ready)} after it was ready"
-                )
+            _check_order(output, arrived[output.frame])
+            here, ready = arrived[output.frame] - zero, output.ready_ns - zero
             if frame > 0 and last < 0:  # of the initialisation the log does not tell
                 boxes[0], elapsed_ns[0], last = init_box, 0, 0
                 ready_ns.append(0)
@@ -460,7 +448,8 @@ class _Timeline:
                 box = output.box or box
             boxes[frame], elapsed_ns[frame] = box, ready - start
             score[frame] = math.nan if output.score is None else output.score
-            if begun is not None:
+            if output.started_ns is not None:
+                begun = output.started_ns - zero
                 if begun < free:
                     overlapping += 1
                 else:
@@ -477,6 +466,21 @@ class _Timeline:
         notes = [f"{count:,} {what}" for what, count in counted.items() if count]
         stages = {"queue": queue, "tracker": call} if (call >= 0).any() else {}
         return cls(boxes, elapsed_ns, score, stages, ready_ns, lost, init_note, notes)
+
+
+def _check_order(output: LoggedOutput, arrived_ns: int) -> None:
+    """Check that a frame arrives, its call begins and its output is ready, in this order."""
+    started_ns = output.ready_ns if output.started_ns is None else output.started_ns
+    for what, at in (("ready", output.ready_ns), ("started", started_ns)):
+        if at < arrived_ns:
+            raise LaeError(
+                f"{output.where}: {what} {seconds(arrived_ns - at)} before its frame arrived; if the "
+                "log received the frame later than the tracker did, --arrivals captured takes the "
+                "time of its capture"
+            )
+    if started_ns > output.ready_ns:
+        late = seconds(started_ns - output.ready_ns)
+        raise LaeError(f"{output.where}: started {late} after it was ready")
 
 
 def _differs(recording: Recording, clock: Clock, timeline: _Timeline) -> bool:
