@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lae_sim.datasets.numbers import NUMBER, read_text
 from lae_sim.decoding import Budget
-from lae_sim.engine.clock import UNIT_NS
+from lae_sim.engine.clock import UNIT_NS, fitting
 from lae_sim.errors import LaeError, hint, listed
 from lae_sim.importers.logs import Box, Log, LoggedFrame, LoggedOutput
 
@@ -188,7 +188,9 @@ class _Row:
 
     def time(self, name: str) -> int | None:
         exact = self._exact(name)
-        return None if exact is None else round(exact * self.columns[name][1])
+        if exact is None:
+            return None
+        return fitting(round(exact * self.columns[name][1]), f"{self.where}: {name}")
 
     def box(self, names: Sequence[str]) -> Box | None:
         numbers = [self._exact(name) for name in names]

@@ -37,6 +37,8 @@ LOG_FORMATS = ("ros", "csv")
 ARRIVALS = ("received", "captured")
 GAPS = ("dropped", "skipped")
 
+_LONGEST_NS = 10**17  # three years
+
 
 def log_format(path: Path, wanted: str = "auto") -> str | None:
     """The format of a log, of :data:`LOG_FORMATS`; None where it looks like results.
@@ -428,7 +430,7 @@ class _Timeline:
                 continue
             if (other := of_frame.setdefault(output.frame, output)) is not output:
                 raise LaeError(f"{output.where}: a second output of the frame of {other.where}")
-            _check_order(output, arrived[output.frame])
+            _check_output(output, arrived[output.frame])
             here, ready = arrived[output.frame] - zero, output.ready_ns - zero
             if frame > 0 and last < 0:  # of the initialisation the log does not tell
                 boxes[0], elapsed_ns[0], last = init_box, 0, 0
@@ -468,19 +470,24 @@ class _Timeline:
         return cls(boxes, elapsed_ns, score, stages, ready_ns, lost, init_note, notes)
 
 
-def _check_order(output: LoggedOutput, arrived_ns: int) -> None:
+def _check_output(output: LoggedOutput, arrived_ns: int) -> None:
     """Check that a frame arrives, its call begins and its output is ready, in this order."""
+    if output.score is not None and not abs(output.score) <= np.finfo(np.float32).max:
+        raise LaeError(f"{output.where}: the score {output.score} is no possible one")
     started_ns = output.ready_ns if output.started_ns is None else output.started_ns
     for what, at in (("ready", output.ready_ns), ("started", started_ns)):
         if at < arrived_ns:
             raise LaeError(
-                f"{output.where}: {what} {seconds(arrived_ns - at)} before its frame arrived; if the "
-                "log received the frame later than the tracker did, --arrivals captured takes the "
-                "time of its capture"
+                f"{output.where}: {what} {seconds(arrived_ns - at)} before its frame arrived; if "
+                "the log received the frame later than the tracker did, --arrivals captured takes "
+                "the time of its capture"
             )
     if started_ns > output.ready_ns:
         late = seconds(started_ns - output.ready_ns)
         raise LaeError(f"{output.where}: started {late} after it was ready")
+    if output.ready_ns - arrived_ns > _LONGEST_NS:
+        late = seconds(output.ready_ns - arrived_ns)
+        raise LaeError(f"{output.where}: ready {late} after its frame arrived: are the clocks one?")
 
 
 def _differs(recording: Recording, clock: Clock, timeline: _Timeline) -> bool:

@@ -113,7 +113,7 @@ def read_bag(path: Path, options: BagOptions) -> Log:
     try:
         with (rosbag1 if path.suffix == ".bag" else rosbag2).Reader(path) as reader:
             return _Bag(path, reader, options).log()
-    except (LaeError, MemoryError):
+    except LaeError:
         raise
     except Exception as error:  # a damaged bag can raise anything
         raise LaeError(f"{path}: not a readable bag: {_reason(error)}") from error
@@ -161,6 +161,8 @@ def _type(name: str) -> str:
 
 def _reason(error: Exception) -> str:
     """What a library's error says, in one line."""
+    if isinstance(error, MemoryError):
+        return "it asks for more memory than there is"
     return one_line(str(error))[:200] or type(error).__name__
 
 
@@ -315,8 +317,6 @@ class _Bag:
                 content = decode(data, kind)
             except StopIteration:
                 return
-            except MemoryError:
-                raise
             except Exception as error:  # what is damaged can raise anything
                 raise LaeError(f"{where}: damaged: {_reason(error)}") from error
             at = _nanoseconds(_value(content, stamp, where), f"{where}: {stamp}")
@@ -509,6 +509,7 @@ def _of_fields(message: _Message, fields: Mapping[str, str]) -> _Answer:
         if name not in ("stamp", "started", "ready")
     }
     score = found.get("score")
+    score = None if score is None or math.isnan(score) else score
     if "cx" in found:
         found["x"], found["y"] = found["cx"] - found["w"] / 2, found["cy"] - found["h"] / 2
     if "x2" in found:

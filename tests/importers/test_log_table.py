@@ -111,6 +111,11 @@ def test_gaps_are_asked_about(table) -> None:
         (HEADER, ["0,0,soon,10,20,30,40"], r"line 2: ready is 'soon', not a number"),
         (HEADER, ["0,0,1_0,10,20,30,40"], r"line 2: ready is '1_0', not a number"),
         (HEADER, ["0,0,1e99,10,20,30,40"], r"line 2: ready is '1e99', an impossible number"),
+        (
+            HEADER,
+            ["0,0,1e15,10,20,30,40"],
+            r"line 2: ready: too long a time: 292 years are the most",
+        ),
         (HEADER, ["0.5,0,1,10,20,30,40"], r"line 2: frame is '0.5', no whole number"),
         (HEADER, [",0,1,10,20,30,40"], r"line 2: frame is '', no whole number"),
         (HEADER, [*ROWS, "2,80,90,1,2,3,4"], r"line 5: frame 2 does not come after frame 2"),

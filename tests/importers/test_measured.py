@@ -240,6 +240,7 @@ def test_truth_of_a_file(tmp_path: Path) -> None:
         ((0, 4, -MS), r"line 2: ready 1 ms before its frame arrived; if the log received"),
         ((0, 3, -2 * MS), r"line 2: started 2 ms before its frame arrived"),
         ((0, 3, 41 * MS), r"line 2: started 1 ms after it was ready"),
+        ((0, 4, 10**18), r"line 2: ready 1e\+09 s after its frame arrived: are the clocks one\?"),
     ],
 )
 def test_times_that_cannot_be(tmp_path: Path, change: tuple[int, int, int], message: str) -> None:
@@ -248,6 +249,12 @@ def test_times_that_cannot_be(tmp_path: Path, change: tuple[int, int, int], mess
     rows[row][column] = value
     with pytest.raises(LaeError, match=message):
         convert_log(written(tmp_path, rows), fps=30)
+
+
+def test_a_score_that_no_trace_can_hold(tmp_path: Path) -> None:
+    path = written(tmp_path, [[0, 0, 1, 1, 2, 3, 4, 1e39]], "frame,arrived_s,ready_s,x,y,w,h,score")
+    with pytest.raises(LaeError, match=r"line 2: the score 1e\+39 is no possible one"):
+        convert_log(path, fps=30)
 
 
 def test_logs_without_anything(tmp_path: Path) -> None:
