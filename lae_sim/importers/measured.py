@@ -38,6 +38,7 @@ ARRIVALS = ("received", "captured")
 GAPS = ("dropped", "skipped")
 
 _LONGEST_NS = 10**17  # three years
+_MOST_SCORE = float(np.finfo(np.float32).max)
 
 
 def log_format(path: Path, wanted: str = "auto") -> str | None:
@@ -472,7 +473,7 @@ class _Timeline:
 
 def _check_output(output: LoggedOutput, arrived_ns: int) -> None:
     """Check that a frame arrives, its call begins and its output is ready, in this order."""
-    if output.score is not None and not abs(output.score) <= np.finfo(np.float32).max:
+    if output.score is not None and not abs(output.score) <= _MOST_SCORE:
         raise LaeError(f"{output.where}: the score {output.score} is no possible one")
     started_ns = output.ready_ns if output.started_ns is None else output.started_ns
     for what, at in (("ready", output.ready_ns), ("started", started_ns)):

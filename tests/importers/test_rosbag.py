@@ -439,6 +439,18 @@ def test_a_turned_box(tmp_path: Path) -> None:
         convert_log(bag)
 
 
+@pytest.mark.parametrize("score", [1e39, np.inf])
+def test_a_score_that_no_trace_can_hold(tmp_path: Path, score: float) -> None:
+    def scored(ns: int, box: Any) -> Any:
+        return detection(ns, box, score=score)
+
+    bag = write_bag(tmp_path / "flight", [*frames(), *boxes(scored)])
+    with pytest.raises(
+        LaeError, match=r"message 1 of /tracker/box: the score .* is no possible one"
+    ):
+        convert_log(bag)
+
+
 def test_images_that_change_size(tmp_path: Path) -> None:
     some = frames()
     some[5] = (*some[5][:2], image(START + 5 * FRAME, 320, 240))
