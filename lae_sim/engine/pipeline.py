@@ -44,7 +44,7 @@ class Camera:
             with that probability, by a seed), or their numbers.
 
     Raises:
-        LaeError: if a duration is none.
+        LaeError: if a duration is none, or the drops are neither text nor a list.
 
     Example:
         >>> import lae_sim
@@ -63,6 +63,11 @@ class Camera:
         for key in ("exposure", "delivery"):
             _named(f"camera: {key}", parse_duration, getattr(self, key))
         if not isinstance(self.drops, str):
+            if not isinstance(self.drops, Sequence):
+                raise LaeError(
+                    f"camera: drops: 'every:10', 'share:0.05:1' or a list of frames, not "
+                    f"{shown(self.drops)}"
+                )
             object.__setattr__(self, "drops", tuple(self.drops))
 
     @property
@@ -132,6 +137,10 @@ class Stage:
                 least_one = "a whole number" if least is None else f"a whole number from {least}"
                 more = ", or None for any number of frames" if key == "queue" else ""
                 raise LaeError(f"{where}: {key}: {shown(value)} is not {least_one}{more}")
+        for key in ("resource", "after"):
+            value = getattr(self, key)
+            if value is not None and (not isinstance(value, str) or not value):
+                raise LaeError(f"{where}: {key}: a name, not {shown(value)}")
         if self.when_full not in WHEN_FULL:
             raise LaeError(
                 f"{where}: when_full: no {shown(self.when_full)}: there are "
@@ -179,10 +188,12 @@ class Pipeline:
         if not isinstance(self.camera, Camera):
             raise LaeError(f"camera: such as Camera(delivery='8ms'), not {shown(self.camera)}")
         object.__setattr__(self, "stages", _in_order(self.stages))
+        if not isinstance(self.name, str) or not self.name or not self.name.isprintable():
+            raise LaeError(f"name: {shown(self.name)} is no name of a pipeline: text in one line")
         names = [stage.name for stage in self.stages]
         if self.tracker not in names:
             raise LaeError(
-                f"no stage is called {self.tracker!r}: there are {listed(names) or 'none'}; "
+                f"no stage is called {shown(self.tracker)}: there are {listed(names) or 'none'}; "
                 "the key tracker says which of them is the tracker"
             )
         for name, capacity in self.resources.items():
@@ -256,8 +267,8 @@ def _in_order(stages: Iterable[Stage]) -> tuple[Stage, ...]:
         ready = [stage for stage in rest.values() if stage.after in (CAMERA, *ordered)]
         if not ready:
             raise LaeError(
-                f"stage {next(iter(rest))!r}: after: a loop: {listed(rest)} come after each other, "
-                "and none after the camera"
+                f"stage {next(iter(rest))!r}: after: a loop: none of {listed(rest)} comes after the "
+                "camera, or after what does"
             )
         ordered[ready[0].name] = rest.pop(ready[0].name)
     return tuple(ordered.values())

@@ -143,7 +143,7 @@ def simulate_pipeline(
             length,
             clock.ticks_per_ns,
             services[stage.name],
-            resources.get(stage.resource or ""),
+            None if stage.resource is None else resources[stage.resource],
             takes=_TAKES + place,
             asks=_TAKES + len(pipeline.stages) * (1 + urgencies.index(stage.priority)) + place,
             returns=_TAKES + len(pipeline.stages) * (1 + len(urgencies)),
@@ -152,7 +152,7 @@ def simulate_pipeline(
         )
     for name, each in work.items():
         each.following = [work[stage.name] for stage in pipeline.after(name)]
-        for _ in range(each.stage.workers):
+        for _ in range(min(each.stage.workers, length)):  # more would never get a frame
             environment.process(each.worker())
     first = [work[stage.name] for stage in pipeline.after(CAMERA)]
     delivered: list[float] = [-1] * length

@@ -52,7 +52,7 @@ from lae_sim.replay.latency import (
     scaled,
     stream,
 )
-from lae_sim.replay.names import LATENCIES, named, parse_latency, text
+from lae_sim.replay.names import LATENCIES, named, parse_latency
 from lae_sim.trace.recording import Recording
 
 if TYPE_CHECKING:
@@ -102,9 +102,6 @@ def parse_pipeline(document: Mapping[str, Any], name: str = "pipeline") -> Pipel
     stages = values.get("stages")
     if not isinstance(stages, (list, tuple)) or not stages:
         raise LaeError("stages: a pipeline has at least one: [[stages]], with its name")
-    for key in ("name", "tracker"):
-        if key in values:
-            named(key, text, values[key])
     resources = values.get("resources", {})
     if not isinstance(resources, Mapping):
         raise LaeError(f"resources: a table of whole numbers by name, not {shown(resources)}")
@@ -160,7 +157,8 @@ def parse_time(name: str) -> LatencySource:
     if kind == "uniform":
         if (found := _RANGE.match(value)) is None:
             raise LaeError(f"{name!r}: write uniform:LOW-HIGH:SEED, such as uniform:0ms-8ms:1")
-        return Uniform(parse_duration(found[1]), parse_duration(found[2]), int(found[3]))
+        seed = named("SEED", whole, found[3])
+        return Uniform(parse_duration(found[1]), parse_duration(found[2]), seed)
     if name[:1].isdigit() and name[-1:] == "s":
         return Constant(parse_duration(name))
     try:
@@ -186,7 +184,7 @@ def parse_drops(drops: Any) -> Callable[[Recording], frozenset[int]]:
     if kind == "share" and (found := _SHARE.match(value)):
         share = named("drops", exact, found[1])
         if 0 <= share < 1:
-            return partial(_share, share, int(found[2]))
+            return partial(_share, share, named("drops: SEED", whole, found[2]))
     raise LaeError(
         f"drops: {shown(drops)}: write every:N, share:P:SEED with P from 0 to below 1, or a list "
         "of frames"

@@ -57,6 +57,9 @@ def test_the_tracker_may_be_called_otherwise() -> None:
         ({"priority": "high"}, "stage 'tracker': priority: 'high' is not a whole number"),
         ({"when_full": "drop_oldest"}, "did you mean 'drop-oldest'"),
         ({"when_full": []}, "stage 'tracker': when_full: no \\[\\]"),
+        ({"resource": ["gpu"]}, "stage 'tracker': resource: a name, not \\['gpu'\\]"),
+        ({"resource": ""}, "stage 'tracker': resource: a name, not ''"),
+        ({"after": ["camera"]}, "stage 'tracker': after: a name, not \\['camera'\\]"),
     ],
 )
 def test_a_stage_refuses(values: dict[str, Any], says: str) -> None:
@@ -74,7 +77,7 @@ def test_a_stage_refuses(values: dict[str, Any], says: str) -> None:
         ([Stage("tracker", after="tracker")], "stage 'tracker': after: a loop"),
         (
             [Stage("decode", after="tracker"), Stage("tracker", after="decode")],
-            "after: a loop: decode, tracker come after each other",
+            "after: a loop: none of decode, tracker comes after the camera",
         ),
         (
             [Stage("decode"), Stage("tracker", resource="gpu")],
@@ -100,6 +103,9 @@ def test_a_pipeline_refuses(stages: Any, says: str) -> None:
         ({"resources": {"gpu": 0}}, "resources: gpu: 0 is not a whole number from 1"),
         ({"camera": "fast"}, "camera: such as Camera"),
         ({"tracker": "siam"}, "no stage is called 'siam'"),
+        ({"tracker": ["siam"]}, "no stage is called \\['siam'\\]"),
+        ({"name": "drone\n"}, "name: 'drone.n' is no name of a pipeline"),
+        ({"name": 5}, "name: 5 is no name of a pipeline"),
     ],
 )
 def test_what_stands_beside_the_stages(values: dict[str, Any], says: str) -> None:
@@ -112,3 +118,9 @@ def test_what_stands_beside_the_stages(values: dict[str, Any], says: str) -> Non
 def test_a_camera_takes_durations(key: str, value: Any) -> None:
     with pytest.raises(LaeError, match=f"camera: {key}: .* is not a duration"):
         Camera(**{key: value})
+
+
+@pytest.mark.parametrize("drops", [5, True, {"every": 10}, None])
+def test_a_camera_loses_frames_that_are_listed(drops: Any) -> None:
+    with pytest.raises(LaeError, match="camera: drops: .* or a list of frames, not"):
+        Camera(drops=drops)

@@ -244,6 +244,12 @@ def test_a_full_queue_lets_the_initialisation_in() -> None:
     assert ms(scale.taken)[:3] == [101, 41, 161]
 
 
+def test_workers_without_end_are_as_many_as_there_are_frames() -> None:
+    stages = [Stage("tracker", workers=10**18)]
+    schedule = simulate_pipeline(Pipeline(stages), 4, CLOCK, constant(tracker=1000))
+    assert ms(schedule.start) == [0, 40, 80, 120]
+
+
 def test_two_trackers_on_one_gpu_take_turns() -> None:
     stages = [Stage(name, resource="gpu", after="camera") for name in ("tracker", "other")]
     pipeline = Pipeline(stages, resources={"gpu": 1})

@@ -142,6 +142,14 @@ def test_the_sample_is_one() -> None:
             "camera = {drops = 'some'}\nstages = [{name = 'tracker'}]",
             "camera: drops: 'some': write",
         ),
+        (
+            f"stages = [{{name = 'tracker', time = 'uniform:0ms-8ms:{'9' * 5000}'}}]",
+            "stage 'tracker': time: SEED: .* is not a whole number",
+        ),
+        (
+            f"camera = {{drops = 'share:0.5:{'9' * 5000}'}}\nstages = [{{name = 'tracker'}}]",
+            "camera: drops: SEED: .* is not a whole number",
+        ),
         ("camera = {drops = [-1]}\nstages = [{name = 'tracker'}]", "camera: drops: -1 is not"),
         ("stage = 3", "pipeline: unknown key 'stage'; did you mean 'stages'"),
         ("stages = ", "Invalid value"),
