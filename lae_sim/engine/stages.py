@@ -11,9 +11,10 @@ What happens at one tick happens in this order, whatever was scheduled first:
 
 Whenever a step lets an earlier one happen, as a stage of 0 ns does, that one is next. A queue holds
 frames by number, the oldest is taken first. Frame 0 is the tracker's initialisation: no queue drops
-it, the tracker drops frames that come before it, and nothing of it is passed on, since the initial
-box is known from time 0. The tracker drops a frame that is older than its last one. From the end of
-the stream on, no stage but those after the tracker begins a frame; what it has begun goes its way.
+it, the tracker drops frames that come before it, none of its workers takes another meanwhile, and
+nothing of it is passed on, since the initial box is known from time 0. The tracker drops a frame
+that is older than its last one. From the end of the stream on, no stage but those after the tracker
+begins a frame; what it has begun goes its way.
 """
 
 from __future__ import annotations
@@ -304,7 +305,8 @@ class _Work:
 
     def _let_take(self) -> None:
         """Give a worker its turn at this tick, if one is idle and a frame waits."""
-        if self.idle and self.waiting and not self.has_turn:
+        initialises = self.is_tracker and self.taken[0] >= 0 and self.finished[0] < 0
+        if self.idle and self.waiting and not self.has_turn and not initialises:
             self.has_turn = True
             _Turn(self.environment, self.takes).callbacks.append(self._take)
 

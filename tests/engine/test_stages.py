@@ -245,9 +245,16 @@ def test_a_full_queue_lets_the_initialisation_in() -> None:
 
 
 def test_workers_without_end_are_as_many_as_there_are_frames() -> None:
-    stages = [Stage("tracker", workers=10**18)]
-    schedule = simulate_pipeline(Pipeline(stages), 4, CLOCK, constant(tracker=1000))
-    assert ms(schedule.start) == [0, 40, 80, 120]
+    stages = [Stage("decode", workers=10**18), Stage("tracker", queue=None)]
+    schedule = simulate_pipeline(Pipeline(stages), 4, CLOCK, constant(decode=100, tracker=1))
+    assert ms(schedule.stages["decode"].started) == [0, 40, 80, 120]
+
+
+def test_no_worker_of_the_tracker_begins_before_it_is_initialised() -> None:
+    services = {"tracker": lambda frame: (10 if frame else 90) * MS}
+    stages = [Stage("tracker", workers=2, queue=None)]
+    schedule = simulate_pipeline(Pipeline(stages), 4, CLOCK, services)
+    assert ms(schedule.start) == [0, 90, 90, 120]
 
 
 def test_two_trackers_on_one_gpu_take_turns() -> None:
