@@ -84,7 +84,8 @@ class Stage:
         name: of small letters, digits and ``_``.
         time: where its times come from: a duration such as ``"6ms"``, the name of a latency such as
             ``"lognormal:1"``, or a function of the recording. By default the tracker has the
-            world's latency, and another stage the times that the trace has recorded for it.
+            world's latency (of recorded times, what is left to it beside the pipeline's other
+            stages), and another stage the times that the trace has recorded for it.
         workers: frames that it works on at once.
         queue: frames that may wait, besides those being worked on; None for any number.
         when_full: what is done with a frame that comes when so many wait: ``"drop-oldest"`` and

@@ -244,6 +244,20 @@ class PipelineTimes:
                 )
         return cls(pipeline, found, jitter, named("camera", parse_drops, camera.drops), scale)
 
+    def of_tracker(self, recording: Recording) -> Recording:
+        """A recording whose times are those of the tracker alone.
+
+        What it says of the pipeline's other stages is a part of the call's time, and would count
+        twice: it is taken off.
+        """
+        apart = {stage for stage in self.sources if stage != self.pipeline.tracker}
+        for stage in tuple(apart):
+            apart.update(_recorded_stages(self.sources[stage]))
+        elapsed = recording.elapsed_ns
+        for stage in apart & recording.stages.keys():
+            elapsed = elapsed - np.maximum(recording.stages[stage], 0)
+        return replace(recording, elapsed_ns=elapsed)
+
     def schedule(
         self, recording: Recording, clock: Clock, tracker: Service, repetition: int = 0
     ) -> PipelineSchedule:
@@ -304,6 +318,13 @@ def _draws_on_recorded(source: LatencySource) -> bool:
     if isinstance(source, Initialised):
         return _draws_on_recorded(source.source)
     return source in (by_frame, by_call) or isinstance(source, RandomSource)
+
+
+def _recorded_stages(source: LatencySource) -> tuple[str, ...]:
+    """The recorded stages whose times a source takes."""
+    if isinstance(source, Initialised):
+        return _recorded_stages(source.source)
+    return source.stages if isinstance(source, StageTimes) else ()
 
 
 def _named_after(stage: str, recording: Recording) -> Recording:

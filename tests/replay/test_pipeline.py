@@ -180,6 +180,30 @@ def test_a_stage_takes_what_was_recorded_for_it() -> None:
     assert took_ms(run(TWO, recording), "decode").tolist() == expected.tolist()
 
 
+def test_what_is_recorded_of_other_stages_is_no_part_of_the_tracker_s_time() -> None:
+    recording = staged(6)
+    whole = recording.elapsed_ns
+    for pipeline, parts in [
+        (TWO, ["decode"]),
+        (Pipeline([Stage("decode", "1ms"), Stage("tracker")]), ["decode"]),
+        (Pipeline([Stage("read", "stage:decode,init=9ms"), Stage("tracker")]), ["decode"]),
+        (Pipeline([Stage("read", "1ms"), Stage("tracker")]), []),
+        (Pipeline([Stage("tracker")]), []),
+    ]:
+        for latency in ("recorded", "resample:1"):
+            runs = replay_trace(trace_of(recording), pipeline=pipeline, latency=latency)
+            (found,) = runs
+            left = whole - sum(recording.stages[part] for part in parts)
+            schedule = found.schedule
+            took = (schedule.ready - schedule.start) // schedule.clock.ticks_per_ns
+            if latency == "recorded":
+                assert took.tolist() == left[schedule.frames].tolist()
+            else:
+                assert set(took.tolist()) <= set(left.tolist())
+    unknown = replace(recording, stages={"decode": np.full(6, -1)})
+    assert PipelineTimes.of(TWO).of_tracker(unknown).elapsed_ns.tolist() == whole.tolist()
+
+
 @pytest.mark.parametrize("time", ["recorded", "by-call", "bootstrap:1", "lognormal:1"])
 def test_other_latencies_draw_on_the_stage_s_own_times(time: str) -> None:
     took = took_ms(run(Pipeline([Stage("decode", time), Stage("tracker")]), staged()), "decode")
