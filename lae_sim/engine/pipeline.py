@@ -268,8 +268,8 @@ def _in_order(stages: Iterable[Stage]) -> tuple[Stage, ...]:
         ready = [stage for stage in rest.values() if stage.after in (CAMERA, *ordered)]
         if not ready:
             raise LaeError(
-                f"stage {next(iter(rest))!r}: after: a loop: none of {listed(rest)} comes after the "
-                "camera, or after what does"
+                f"stage {next(iter(rest))!r}: after: a loop: none of {listed(rest)} comes after "
+                "the camera, or after what does"
             )
         ordered[ready[0].name] = rest.pop(ready[0].name)
     return tuple(ordered.values())

@@ -122,5 +122,5 @@ def test_a_camera_takes_durations(key: str, value: Any) -> None:
 
 @pytest.mark.parametrize("drops", [5, True, {"every": 10}, None])
 def test_a_camera_loses_frames_that_are_listed(drops: Any) -> None:
-    with pytest.raises(LaeError, match="camera: drops: .* or a list of frames, not"):
+    with pytest.raises(LaeError, match=r"camera: drops: .* or a list of frames, not"):
         Camera(drops=drops)
