@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.decoding import read_toml
-from lae_sim.engine.clock import Clock, exact, parse_duration, whole
+from lae_sim.engine.clock import Clock, exact, parse_duration, split_init, whole
 from lae_sim.engine.pipeline import CAMERA, Camera, Pipeline, Stage, TimeSource
 from lae_sim.engine.scheduler import Service
 from lae_sim.errors import LaeError, explained, hint, listed, shown
@@ -49,6 +49,7 @@ from lae_sim.replay.latency import (
     Uniform,
     by_call,
     by_frame,
+    initialised,
     scaled,
     stream,
 )
@@ -148,11 +149,14 @@ def parse_time(name: str) -> LatencySource:
 
     Args:
         name: as :func:`.names.parse_latency` takes it; or ``"6ms"``, for ``"constant:6ms"``; or
-            ``"uniform:0ms-8ms:SEED"``, drawn evenly.
+            ``"uniform:0ms-8ms:SEED"``, drawn evenly; all of them perhaps with ``,init=TIME``.
 
     Raises:
         LaeError: if it is none of these.
     """
+    alone, init_ns = split_init(name)
+    if init_ns is not None:
+        return initialised(parse_time(alone), init_ns)
     kind, _, value = name.partition(":")
     if kind == "uniform":
         if (found := _RANGE.match(value)) is None:
@@ -308,6 +312,8 @@ def _source(what: str, source: TimeSource) -> LatencySource:
 
 
 def _repeated(source: LatencySource, repetition: int) -> LatencySource:
+    if isinstance(source, Initialised):
+        return replace(source, source=_repeated(source.source, repetition))
     if isinstance(source, (RandomSource, Uniform)):
         return replace(source, repetition=source.repetition + repetition)
     return source

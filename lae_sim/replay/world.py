@@ -189,8 +189,10 @@ class World:
         if time is None:
             return self.latency
         own: str | LatencySource = time
-        if isinstance(time, str) and hasattr(source := parse_time(time), "label"):
-            own = source
+        if isinstance(time, str):
+            source = parse_time(time)
+            every = source.source if isinstance(source, Initialised) else source
+            own = source if hasattr(every, "label") else time
         if self.latency not in ("recorded", own):
             raise LaeError(
                 f"latency: {label_of(self.latency)}, and the pipeline says {label_of(own)}: leave "

@@ -166,6 +166,18 @@ def test_bad_files_are_named_with_the_stage_and_the_key(
     assert str(caught.value).count("\n") < 2
 
 
+@pytest.mark.parametrize("time", ["6ms", "uniform:6ms-6ms:1", "constant:6ms", "stage:decode"])
+def test_every_time_may_tell_the_initialisation_apart(time: str) -> None:
+    recording = replace(moving(5), stages={"decode": np.full(5, 6 * MS)})
+    pipeline = Pipeline([Stage("decode", f"{time},init=90ms")], tracker="decode")
+    (run,) = replay_trace(trace_of(recording), pipeline=pipeline)
+    assert took_ms(run.schedule, "decode").tolist()[:3] == [90, 6, 6]
+    before = Pipeline([Stage("decode", f"{time},init=90ms"), Stage("tracker", "1ms")])
+    (run,) = replay_trace(trace_of(recording), pipeline=before)
+    assert took_ms(run.schedule, "decode").tolist()[:3] == [90, 6, 6]
+    assert World.of(pipeline=pipeline).label().endswith(",init=90ms")
+
+
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(LaeError, match="no such file"):
         read_pipeline(tmp_path / "drone.toml")
