@@ -184,11 +184,12 @@ class Pipeline:
     name: str = "pipeline"
 
     def __post_init__(self) -> None:
-        if not all(isinstance(stage, Stage) for stage in self.stages):
+        stages = tuple(self.stages) if isinstance(self.stages, Iterable) else (self.stages,)
+        if not all(isinstance(stage, Stage) for stage in stages):
             raise LaeError("stages: a pipeline has stages, such as Stage('decode', '6ms')")
         if not isinstance(self.camera, Camera):
             raise LaeError(f"camera: such as Camera(delivery='8ms'), not {shown(self.camera)}")
-        object.__setattr__(self, "stages", _in_order(self.stages))
+        object.__setattr__(self, "stages", _in_order(stages))
         if not isinstance(self.name, str) or not self.name or not self.name.isprintable():
             raise LaeError(f"name: {shown(self.name)} is no name of a pipeline: text in one line")
         names = [stage.name for stage in self.stages]
@@ -197,6 +198,9 @@ class Pipeline:
                 f"no stage is called {shown(self.tracker)}: there are {listed(names) or 'none'}; "
                 "the key tracker says which of them is the tracker"
             )
+        if not isinstance(self.resources, Mapping):
+            raise LaeError(f"resources: whole numbers by name, not {shown(self.resources)}")
+        object.__setattr__(self, "resources", dict(self.resources))
         for name, capacity in self.resources.items():
             counted = isinstance(capacity, Integral) and not isinstance(capacity, bool)
             if not counted or capacity < 1:

@@ -35,7 +35,7 @@ from lae_sim._arrays import Ints
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.pipeline import CAMERA, Pipeline, Stage
 from lae_sim.engine.scheduler import NEVER, Schedule, Service
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, described
 
 Process: TypeAlias = "Generator[simpy.Event, Any, None]"
 
@@ -115,9 +115,9 @@ def simulate_pipeline(
         lost: frames that the camera does not deliver; frame 0 always is.
 
     Raises:
-        LaeError: if the sequence is empty, or a time negative, or an instant does not fit in 64-bit
-            ticks; it names the stage and the frame.
-        TypeError: if a time is not an integer, such as seconds as a float.
+        LaeError: if the sequence is empty, a time is negative or no integer, such as seconds as a
+            float, a service raises something, or an instant does not fit in 64-bit ticks; it names
+            the stage and the frame.
 
     Example:
         >>> from lae_sim.engine import Clock, Pipeline, Stage, simulate_pipeline
@@ -390,9 +390,14 @@ def _time(what: str, service: Callable[[int], int], frame: int) -> int:
     """What a frame takes, ns.
 
     Raises:
-        LaeError: if it is negative.
+        LaeError: if it is negative or no integer, or the service raises something.
     """
-    ns = index(service(frame))
+    try:
+        ns = index(service(frame))
+    except LaeError:
+        raise
+    except Exception as error:  # SimPy would raise a copy, which does not tell where it was
+        raise LaeError(f"{what}, frame {frame}: {described(error)}") from error
     if ns < 0:
         raise LaeError(f"{what}, frame {frame}: a time cannot be negative ({ns} ns)")
     return ns

@@ -103,13 +103,9 @@ def parse_pipeline(document: Mapping[str, Any], name: str = "pipeline") -> Pipel
     stages = values.get("stages")
     if not isinstance(stages, (list, tuple)) or not stages:
         raise LaeError("stages: a pipeline has at least one: [[stages]], with its name")
-    resources = values.get("resources", {})
-    if not isinstance(resources, Mapping):
-        raise LaeError(f"resources: a table of whole numbers by name, not {shown(resources)}")
     values |= {
         "name": values.get("name", name),
         "camera": Camera(**_checked("camera", values.get("camera", {}), Camera)),
-        "resources": dict(resources),
         "stages": [_stage(place, each) for place, each in enumerate(stages, 1)],
     }
     pipeline = Pipeline(**values)

@@ -193,7 +193,8 @@ class World:
             source = parse_time(time)
             every = source.source if isinstance(source, Initialised) else source
             own = source if hasattr(every, "label") else time
-        if self.latency not in ("recorded", own):
+        alike = isinstance(self.latency, str) and label_of(self.latency) == label_of(own)
+        if not (alike or self.latency in ("recorded", own)):
             raise LaeError(
                 f"latency: {label_of(self.latency)}, and the pipeline says {label_of(own)}: leave "
                 f"out the time of its stage {pipeline.tracker!r}"

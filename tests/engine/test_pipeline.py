@@ -40,6 +40,14 @@ def test_stages_stand_in_any_order_if_they_say_what_they_come_after() -> None:
     assert pipeline.output == "publish"
 
 
+def test_what_it_is_made_of_is_its_own() -> None:
+    resources = {"gpu": 1}
+    made = Pipeline((stage for stage in [Stage("decode"), TRACKER]), resources=resources)
+    resources["gpu"] = 0
+    assert made == Pipeline([Stage("decode"), TRACKER], resources={"gpu": 1})
+    assert Pipeline(TRACKER) == Pipeline([TRACKER])  # type: ignore[arg-type]
+
+
 def test_the_tracker_may_be_called_otherwise() -> None:
     assert Pipeline([Stage("siam"), Stage("send")], tracker="siam").output == "send"
 
@@ -89,6 +97,7 @@ def test_a_stage_refuses(values: dict[str, Any], says: str) -> None:
             "stage 'record': after: what comes after the tracker does not branch, and 'publish'",
         ),
         (["tracker"], "a pipeline has stages"),
+        (5, "a pipeline has stages"),
     ],
 )
 def test_a_pipeline_refuses(stages: Any, says: str) -> None:
@@ -101,6 +110,7 @@ def test_a_pipeline_refuses(stages: Any, says: str) -> None:
     ("values", "says"),
     [
         ({"resources": {"gpu": 0}}, "resources: gpu: 0 is not a whole number from 1"),
+        ({"resources": ["gpu"]}, "resources: whole numbers by name, not \\['gpu'\\]"),
         ({"camera": "fast"}, "camera: such as Camera"),
         ({"tracker": "siam"}, "no stage is called 'siam'"),
         ({"tracker": ["siam"]}, "no stage is called \\['siam'\\]"),

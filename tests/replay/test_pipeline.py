@@ -135,7 +135,7 @@ def test_the_sample_is_one() -> None:
         ("stages = [{name = 'tracker'}, {name = 'tracker'}]", "stage 'tracker': name: two"),
         ("stages = [{name = 'tracker', after = 'tracker'}]", "stage 'tracker': after: a loop"),
         ("stages = [{name = 'tracker', resource = 'gpu'}]", "stage 'tracker': resource: no 'gpu'"),
-        ("resources = 3\nstages = [{name = 'tracker'}]", "resources: a table"),
+        ("resources = 3\nstages = [{name = 'tracker'}]", "resources: whole numbers by name"),
         ("camera = {delay = '3ms'}\nstages = [{name = 'tracker'}]", "camera: unknown key 'delay'"),
         ("camera = {jitter = 'recorded'}\nstages = [{name = 'tracker'}]", "camera: jitter: 'reco"),
         (
@@ -277,6 +277,7 @@ def test_the_world_s_latency_is_the_tracker_s() -> None:
     assert (world.label(), world.times_kind) == ("constant:47ms", "constant")
     assert replace(world, sigmas=(Fraction(1),)).label() == "constant:47ms"
     assert world.policy_label == "pipeline:own"
+    assert World.of(pipeline=own, latency="constant:47ms") == world
     with pytest.raises(
         LaeError, match="latency: constant:3ms, and the pipeline says constant:47ms"
     ):
@@ -343,7 +344,7 @@ def test_times_of_one_s_own_are_functions() -> None:
     endless = Pipeline(
         [Stage("decode", lambda recording: lambda frame: float("inf")), Stage("tracker")]
     )
-    with pytest.raises(LaeError, match="sequence 'a': pipeline: TypeError"):
+    with pytest.raises(LaeError, match="sequence 'a': stage 'decode', frame 0: TypeError"):
         list(replay_trace(trace_of(moving(5)), pipeline=endless))
     with pytest.raises(LaeError, match="stage 'decode': time: 3 is no time"):
         World.of(pipeline=Pipeline([Stage("decode", 3), Stage("tracker")]))  # type: ignore[arg-type]
