@@ -292,9 +292,16 @@ class PipelineTimes:
 
     def _service(self, stage: str, recording: Recording, repetition: int) -> Service:
         source = _repeated(self.sources[stage], repetition)
+        drawn = _draws_on_recorded(source)
+        for name in (stage,) if drawn else _recorded_stages(source):
+            if name not in recording.stages:
+                raise LaeError(
+                    f"sequence {recording.name!r}: the trace has no times of stage {name!r}: give "
+                    f"the pipeline's stage {stage!r} a time, such as '6ms'"
+                )
         own = _named_after(stage, recording)
         with explained(f"stage {stage!r}: time"):
-            if _draws_on_recorded(source):
+            if drawn:
                 own = replace(own, elapsed_ns=StageTimes((stage,))(own).ns)
             return scaled(source, self.scale)(own)
 

@@ -232,10 +232,11 @@ def test_times_are_scaled_but_not_the_camera() -> None:
 
 
 def test_a_trace_without_the_stage_s_times_says_what_to_do() -> None:
-    with pytest.raises(
-        LaeError, match="'a, stage decode': the trace has no times of stage 'decode'"
-    ):
-        run(TWO, moving(5))
+    decode = Stage("decode", "stage:read+scale")
+    for stages, name in ((TWO.stages, "decode"), ([decode, Stage("tracker")], "read")):
+        says = f"sequence 'a': the trace has no times of stage '{name}': give .* 'decode' a time"
+        with pytest.raises(LaeError, match=says):
+            run(Pipeline(stages), moving(5))
 
 
 def test_streams_differ_from_stage_to_stage_and_from_sequence_to_sequence() -> None:
