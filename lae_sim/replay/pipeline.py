@@ -53,13 +53,14 @@ from lae_sim.replay.latency import (
     scaled,
     stream,
 )
-from lae_sim.replay.names import LATENCIES, named, parse_latency
+from lae_sim.replay.names import LATENCIES, Plugin, kind_of, named, parse_latency
 from lae_sim.trace.recording import Recording
 
 if TYPE_CHECKING:
     from lae_sim.engine.stages import PipelineSchedule
 
 _RANGE = re.compile(r"([0-9.]+[a-z]+)-([0-9.]+[a-z]+):([0-9]+)\Z")
+_TIMES = (*LATENCIES, "uniform")
 _SHARE = re.compile(r"([0-9./]+):([0-9]+)\Z")
 
 
@@ -108,7 +109,7 @@ def parse_pipeline(document: Mapping[str, Any], name: str = "pipeline") -> Pipel
         "camera": Camera(**_checked("camera", values.get("camera", {}), Camera)),
         "stages": [_stage(place, each) for place, each in enumerate(stages, 1)],
     }
-    pipeline = Pipeline(**values)
+    pipeline = with_plugins(Pipeline(**values))
     PipelineTimes.of(pipeline)  # whose names are looked up
     return pipeline
 
@@ -167,6 +168,25 @@ def parse_time(name: str) -> LatencySource:
         if kind in LATENCIES or ":" in name:
             raise
         raise LaeError(f"{error}; or a duration, 6ms, or uniform:LOW-HIGH:SEED") from error
+
+
+def with_plugins(pipeline: Pipeline) -> Pipeline:
+    """The pipeline with what its times name of a user's own, made once.
+
+    Raises:
+        LaeError: if there is none of a name; it names the stage and the key.
+    """
+
+    def made(what: str, time: TimeSource | None) -> TimeSource | None:
+        own = isinstance(time, str) and ":" in time and kind_of(time) not in _TIMES
+        return Plugin(str(time), named(what, parse_time, time)) if own else time
+
+    camera, stages = pipeline.camera, pipeline.stages
+    return replace(
+        pipeline,
+        camera=replace(camera, jitter=made("camera: jitter", camera.jitter)),
+        stages=[replace(s, time=made(f"stage {s.name!r}: time", s.time)) for s in stages],
+    )
 
 
 def parse_drops(drops: Any) -> Callable[[Recording], frozenset[int]]:
@@ -307,6 +327,9 @@ class PipelineTimes:
 
 
 def _source(what: str, source: TimeSource) -> LatencySource:
+    if isinstance(source, Plugin):
+        made: LatencySource = source.made
+        return made
     if isinstance(source, str):
         return named(what, parse_time, source)
     if not callable(source):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -349,6 +350,26 @@ def test_times_of_one_s_own_are_functions() -> None:
         list(replay_trace(trace_of(moving(5)), pipeline=endless))
     with pytest.raises(LaeError, match="stage 'decode': time: 3 is no time"):
         World.of(pipeline=Pipeline([Stage("decode", 3), Stage("tracker")]))  # type: ignore[arg-type]
+
+
+def test_plug_ins_are_made_once(tmp_path: Path) -> None:
+    (tmp_path / "made_once.py").write_text(
+        "made = []\n\nclass Mine:\n    def __init__(self, ms, more=0):\n"
+        "        self.ns = (ms + more) * 1_000_000\n        made.append(ms)\n\n"
+        "    def __call__(self, recording):\n        return lambda frame: self.ns\n"
+    )
+    (tmp_path / "drone.toml").write_text(
+        "camera = {jitter = 'made_once:Mine:ms=3'}\n"
+        "stages = [{name = 'decode', time = 'made_once:Mine:ms=6,more=1'},"
+        " {name = 'tracker', time = 'made_once:Mine:ms=40,init=90ms'}]\n"
+    )
+    trace = trace_of(moving(6))
+    worlds = World.sweep(pipeline=tmp_path / "drone.toml", scale=[1, 2])
+    (run,), (other,) = (world.replay(trace) for world in worlds)
+    assert sorted(sys.modules["made_once"].made) == [3, 6, 40]
+    assert took_ms(run.schedule, "decode").tolist()[:2] == [7, 7]
+    assert took_ms(other.schedule, "tracker").tolist()[:2] == [180, 80]
+    assert worlds[0].label() == "made_once:Mine:ms=40,init=90ms"
 
 
 def test_a_document_has_a_name_of_its_own() -> None:
