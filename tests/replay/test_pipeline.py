@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from places import TRACES
 from witness import moving
 
@@ -165,6 +168,44 @@ def test_bad_files_are_named_with_the_stage_and_the_key(
         read_pipeline(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert str(caught.value).count("\n") < 2
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=9), inner),
+    max_leaves=4,
+)
+WORDS = st.sampled_from(
+    ["tracker", "decode", "camera", "gpu", "block", "6ms", "uniform:1ms-2ms:1", "share:1/2:3"]
+    + ["every:9", "stage:decode", "recorded,init=1ms", ":", "os:path", "-1ms", "9" * 5000 + "ms"]
+)
+
+
+def tables(kind: type) -> st.SearchStrategy[Any]:
+    """Tables of a record's keys, with whatever values."""
+    values = {each.name: ANYTHING | WORDS for each in fields(kind)}
+    return st.fixed_dictionaries({}, optional=values)
+
+
+@settings(max_examples=60)
+@given(
+    tables(Pipeline),
+    st.lists(tables(Stage), max_size=3),
+    tables(Camera) | ANYTHING,
+    st.dictionaries(WORDS, st.integers(0, 2)) | ANYTHING,
+)
+def test_any_document_is_a_pipeline_or_refused(
+    document: dict[str, Any], stages: list[Any], camera: Any, resources: Any
+) -> None:
+    first = {"name": "tracker", "after": "camera"}
+    document = {**document, "stages": [first, *stages], "camera": camera, "resources": resources}
+    document["tracker"] = "tracker"
+    try:
+        pipeline = parse_pipeline(document)
+    except LaeError:
+        return
+    assert parse_pipeline(document) == pipeline
+    World.of(pipeline=pipeline)
 
 
 @pytest.mark.parametrize("time", ["6ms", "uniform:6ms-6ms:1", "constant:6ms", "stage:decode"])
