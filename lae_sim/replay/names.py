@@ -37,6 +37,10 @@ class Plugin:
     label: str
     made: Any = field(compare=False)
 
+    def __call__(self, *arguments: Any) -> Any:
+        """What it makes of some arguments."""
+        return self.made(*arguments)
+
 
 def parse_policy(text: str) -> Policy:
     """A policy by name.

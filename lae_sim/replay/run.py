@@ -561,6 +561,10 @@ class Runs:
                 self.trace.metadata.image_sizes(recording.name),
             )
 
+    def of_tracker(self, times: Recording) -> Recording:
+        """The times that are the tracker's, if it is one of a pipeline's stages."""
+        return times if self.pipeline is None else self.pipeline.of_tracker(times)
+
     def __repr__(self) -> str:
         return f"<Runs of {self.trace!r} at {self.clock.fps} fps>"
 
@@ -626,7 +630,7 @@ def _groups(
     for place, runs in replays:
         for job in runs._jobs():
             with explained("latency"):
-                service = runs.source(job.times)
+                service = runs.source(runs.of_tracker(job.times))
             places.append(place)
             jobs.append(job)
             services.append(service)
@@ -689,7 +693,8 @@ class Repetitions:
             size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
             for begin in range(first, first + count, size):
                 some = range(begin, min(begin + size, first + count))
-                drawn = [source.repeated(job.times, begin, len(some)) for job in jobs]
+                recorded = [self.runs.of_tracker(job.times) for job in jobs]
+                drawn = [source.repeated(each, begin, len(some)) for each in recorded]
                 times = [
                     Times(job.recording.name, rows[k], by_call=True)
                     for k in range(len(some))
