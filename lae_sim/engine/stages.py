@@ -67,6 +67,7 @@ class StageLog:
         finished: when it was done, int64 [T], ticks.
         left: when the worker had handed it on, and was free again, int64 [T], ticks.
         dropped: why it was dropped, :class:`Drop`, int64 [T]; 0 if it was not.
+        gone: when it was dropped, int64 [T], ticks; at the end of the stream, if it still waits.
     """
 
     arrived: Ints
@@ -75,6 +76,7 @@ class StageLog:
     finished: Ints
     left: Ints
     dropped: Ints
+    gone: Ints
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -253,6 +255,7 @@ class _Work:
         self.arrived: list[float] = [-1] * length
         self.taken, self.started = self.arrived.copy(), self.arrived.copy()
         self.finished, self.left = self.arrived.copy(), self.arrived.copy()
+        self.gone = self.arrived.copy()
         self.dropped = [0] * length
 
     def offer(self, frame: int) -> simpy.Event | None:
@@ -274,7 +277,7 @@ class _Work:
     def _enter(self, frame: int) -> None:
         self.arrived[frame] = self.environment.now
         if refusal := self._refusal(frame):
-            self.dropped[frame] = refusal
+            self._drop(frame, refusal)
             return
         waiting, queue = self.waiting, self.stage.queue
         if not waiting or frame > waiting[-1]:
@@ -288,8 +291,11 @@ class _Work:
                 oldest = int(waiting[0] == 0)
                 loser = waiting[oldest]
                 del waiting[oldest]
-            self.dropped[loser] = Drop.FULL
+            self._drop(loser, Drop.FULL)
         self._let_take()
+
+    def _drop(self, frame: int, why: Drop) -> None:
+        self.dropped[frame], self.gone[frame] = why, self.environment.now
 
     def _refusal(self, frame: int) -> Drop:
         """Why a frame would not even be let in."""
@@ -338,7 +344,7 @@ class _Work:
                 holding = resource.request(self.stage.priority)
                 yield holding
             if self._over(frame):
-                self.dropped[frame] = Drop.END
+                self._drop(frame, Drop.END)
             else:
                 self.started[frame] = environment.now
                 ns = _time(f"stage {self.stage.name!r}", self.service, frame)
@@ -364,6 +370,7 @@ class _Work:
         """Say of frames that still wait why they never began."""
         for frame in (*self.waiting, *(frame for frame, _ in self.blocked)):
             self.dropped[frame] = Drop.END
+            self.gone[frame] = max(self.end or 0, self.arrived[frame])
 
     def log(self) -> StageLog:
         """What happened."""
@@ -375,6 +382,7 @@ class _Work:
                 np.array(self.finished, np.int64),
                 np.array(self.left, np.int64),
                 np.array(self.dropped, np.int64),
+                np.array(self.gone, np.int64),
             )
         except OverflowError as error:
             late = max(range(len(self.finished)), key=self.finished.__getitem__)
