@@ -7,10 +7,11 @@ comes, over the time that its workers have. Above 1 it cannot keep up, whatever 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
-from typing import Any
+from operator import itemgetter
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -32,6 +33,25 @@ WHY: Mapping[Drop, str] = {
 
 _REFUSED = (Drop.NOT_ITS_TURN, Drop.OVERTAKEN, Drop.TOO_EARLY)
 _FULL = 1 + 1e-9  # a load above it is more than can be done; less is the rounding of a sum
+
+
+Row = TypeVar("Row")
+
+
+def shared_out(spans: Iterable[tuple[int, float, Row]]) -> Iterator[tuple[int, Row]]:
+    """Spans of time, each with the first of several places that is free as it begins.
+
+    Workers of a stage are alike: so frames are shared out among them, from when a worker takes one
+    until it is free again. There are no more places than workers.
+
+    Args:
+        spans: begin, end, and what it is, in any order.
+    """
+    free_from: list[float] = []
+    for begin, end, row in sorted(spans, key=itemgetter(0, 1)):
+        place = next((p for p, tick in enumerate(free_from) if tick <= begin), len(free_from))
+        free_from[place : place + 1] = [end]
+        yield place, row
 
 
 @dataclass
