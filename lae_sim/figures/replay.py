@@ -245,12 +245,13 @@ def timeline_for_paper(run: Run, sigma: Fraction = Fraction(0)) -> ColumnFigure:
     few = frames[min(4, len(frames) - 1)] - first
     shown = range(first, min(first + min(max(few, 8), 16), schedule.length))
     draw = partial(_draw_timeline, run=run, sigma=sigma, shown=shown, size=6)
+    rows = len(getattr(schedule, "stages", " "))  # of a pipeline; else there is one, the tracker's
     name = run.recording.name
     return ColumnFigure(
         f"timeline-{name}",
         f"{name}: frames as they arrive (hollow: skipped), the tracker at work on them, and the "
         "frame whose output answers the query for each",
-        partial(column_figure, draw, 1.5),
+        partial(column_figure, draw, 1.2 + 0.3 * rows),
     )
 
 

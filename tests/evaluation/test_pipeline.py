@@ -76,7 +76,12 @@ def test_resources_and_answers_that_are_overtaken() -> None:
     ]
     found = report(Pipeline(stages, resources={"gpu": 2}))["pipeline"]
     assert found["resources"] == [
-        {"resource": "gpu", "capacity": 2, "utilisation": pytest.approx(6 * 10 / (2 * 240))}
+        {
+            "resource": "gpu",
+            "capacity": 2,
+            "load": pytest.approx(6 * 10 / (2 * 240)),
+            "utilisation": pytest.approx(6 * 10 / (2 * 240)),
+        }
     ]
     assert (found["outputs"], found["overtaken"]) == (5, 1)
 
