@@ -26,11 +26,11 @@ from targets import Line
 
 from lae_sim import Metadata, Recording, Trace, replay_trace, simulate, write_trace
 from lae_sim._compiled import SWITCH
+from lae_sim.comparison.pairs import Member, pairs_of
 from lae_sim.engine import Times, latest, simulate_lanes
 from lae_sim.evaluation import evaluate_groups
 from lae_sim.forecast import Hold
 from lae_sim.replay import Repetitions, Runs, bootstrap
-from lae_sim.study.pairs import Member, pairs_of
 
 RATES = (15, 20, 25, 30, 40, 50, 60, 90)  # frames/s of the trackers
 REPETITIONS = 81  # 9,963 lanes

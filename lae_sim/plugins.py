@@ -92,9 +92,10 @@ def imported(what: str, name: str) -> tuple[Any, dict[str, Any]]:
             made = getattr(made, part)
     except Exception as error:  # a user's module may fail in any way while it is imported
         said = f"{what}: {type(error).__name__}: {error}"
-        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
-            suffixed = module.endswith(".py")
-            said += "; leave out .py" if suffixed else f"; the current folder is {os.getcwd()}"
+        if isinstance(error, ModuleNotFoundError):
+            named = f"{module}.".startswith(f"{error.name}.")
+            suffixed = named and module.endswith(".py")
+            said += "; leave out .py" if suffixed else f"; searched {', '.join(_searched())}"
         raise LaeError(said) from error
     if not callable(made):
         raise LaeError(f"{what} is not callable: name a class or a function")
@@ -102,6 +103,14 @@ def imported(what: str, name: str) -> tuple[Any, dict[str, Any]]:
         return made, parse_options(dict(map(key_and_value, options.split(",") if colon else ())))
     except LaeError as error:
         raise LaeError(f"{what}: {error}") from error
+
+
+def _searched() -> Iterator[str]:
+    """The folders that modules are looked for in, but for those of the standard library."""
+    library = os.path.dirname(os.__file__)
+    for folder in dict.fromkeys(map(os.path.abspath, sys.path)):
+        if os.path.isdir(folder) and folder not in (library, os.path.join(library, "lib-dynload")):
+            yield folder
 
 
 def _look_here() -> None:

@@ -51,7 +51,8 @@ def run_study(
             themselves, such as ``traces="*.parquet", latencies=["recorded", "bootstrap"]``.
         folder: where results are kept; of a file ``STUDY-results``, else ``study-results``.
             Finished parts found there are not computed again.
-        workers: processes on this machine; by default one for each core. No result depends on it.
+        workers: processes on this machine; by default one for each core, or this one
+            alone where there is little to do. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead.
         report: whether to write ``report.html``, ``figures/`` and ``tables/`` too.
         root: folder of the dataset, for the report to show a few sequences with their images;

@@ -28,6 +28,7 @@ COMMANDS = {
 
 EXTRAS = {
     "torch": "torch",
+    "onnx": "onnxruntime",
     "fast": "numba",
     "film": "av",
     "trax": "vot-trax",

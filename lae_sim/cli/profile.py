@@ -42,7 +42,8 @@ examples:
 
 trackers:
   dcf                     a correlation filter, no weights needed
-  nanotrack               NanoTrack v2 or v3 (--option weights=FOLDER with the two ONNX files)
+  nanotrack               NanoTrack v2 or v3 (--option weights=FOLDER with the two ONNX files), by
+                          OpenCV or with runtime=onnxruntime provider=CPU, CUDA or TensorRT
   opencv:NAME             mil, nano, vit, dasiamrpn; csrt and kcf with the contrib build
   pysot                   SiamRPN++, SiamMask: --option checkout= config= snapshot=
   pytracking              ATOM, DiMP, PrDiMP: --option checkout= tracker= parameter= network=
@@ -79,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
         "--threads",
         type=argument(partial(whole, least=1)),
         metavar="N",
-        help="threads that the tracker may use",
+        help="threads that each library of the tracker may use",
     )
     add(
         "--frame-timeout",

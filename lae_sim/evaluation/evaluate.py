@@ -6,8 +6,9 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
-from itertools import islice
-from typing import TypeAlias, TypeVar
+from itertools import groupby, islice
+from operator import itemgetter
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -19,10 +20,10 @@ from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_score
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scored, Scorer
 from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
-from lae_sim.replay.run import Run, RunBatch, distinct, grouped
+from lae_sim.replay.run import Run, RunBatch, distinct, grouped, regrouped
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes, Metadata
-from lae_sim.trace.recording import Recording
+from lae_sim.trace.recording import BESIDE, Recording
 
 Record = TypeVar("Record", "Staleness", "Curves")
 
@@ -193,6 +194,17 @@ def _joined(records: Sequence[Record], axis: int = 0) -> Record:
     return type(first)(*(np.concatenate(column, axis) for column in columns))
 
 
+def _pieces(record: Record, which: Any, axis: int = 0) -> Record:
+    """Some sequences of each of a record's arrays."""
+    columns = (getattr(record, field.name) for field in fields(record))
+    return type(record)(*(_piece(column, which, axis) for column in columns))
+
+
+def _piece(values: Any, which: Any, axis: int = 0) -> Any:
+    """Some sequences of an array, in one piece: sums are those over an array of its own."""
+    return np.ascontiguousarray(values[(slice(None),) * axis + (which,)])
+
+
 @dataclass(frozen=True, eq=False)
 class Answers:
     """The answer for every world frame of one sequence at one sigma.
@@ -295,7 +307,7 @@ def evaluate_groups(
     if not forecasters:
         raise LaeError("name at least one forecaster, such as hold")
     scoring = _Scoring(
-        metadata,
+        lambda recording: metadata.image_sizes(recording.name),
         forecasters,
         sigmas,
         convention,
@@ -308,9 +320,79 @@ def evaluate_groups(
     for group in grouped(runs, frames):
         if known is None or not known.places.keys() >= set(group.recordings):
             known = _Known.of(group.distinct[0], convention, known)
-        yield scoring.of(group, known)
+        yield from scoring.of([group], known)
     if known is None:
         raise LaeError("there is nothing to evaluate: no sequences")
+
+
+def evaluate_together(
+    replays: Iterable[tuple[int, RunBatch]],
+    metadata: Sequence[Metadata],
+    forecasters: Mapping[str, AnyFactory],
+    sigmas: Sequence[Fraction],
+    convention: Convention = PYSOT,
+    costs: Mapping[str, int] | None = None,
+    frames: int = GROUP_FRAMES,
+) -> Iterator[tuple[int, Evaluation]]:
+    """The groups of :func:`evaluate_groups` of several replays; small groups are scored at once.
+
+    Args:
+        replays: the place of each replay with some of its runs, one replay after another.
+        metadata: of the trace of each replay.
+        forecasters, sigmas, convention, costs, frames: see :func:`evaluate_groups`; at least one
+            forecaster.
+
+    Yields:
+        The place of a replay, and a group of its sequences.
+
+    Raises:
+        LaeError: whatever iterating over the replays raises.
+    """
+    of_recording: dict[Recording, Metadata] = {}
+
+    def image_sizes(recording: Recording) -> ImageSizes | None:
+        return of_recording[recording].image_sizes(recording.name)
+
+    scoring = _Scoring(image_sizes, forecasters, sigmas, convention, costs or {})
+    parts = (
+        (place, group)
+        for place, batches in groupby(replays, itemgetter(0))
+        for group in regrouped((batch for _, batch in batches), frames)
+    )
+    known: _Known | None = None
+    for _, alike in groupby(parts, lambda part: _way(part[1])):
+        for some in _merged(alike, frames):
+            for place, part in some:
+                of_recording.update(dict.fromkeys(part.recordings, metadata[place]))
+            recordings = dict.fromkeys(each for _, part in some for each in part.recordings)
+            if known is None or not known.places.keys() >= recordings.keys():
+                known = _Known.of([*recordings], convention, known)
+            yield from zip((place for place, _ in some), scoring.of([p for _, p in some], known))
+
+
+def _way(runs: RunBatch) -> tuple[int, int, bool, bool]:
+    """Groups that differ in it cannot be paired together, or not as they are alone."""
+    schedules = runs.schedules
+    clock, scored = schedules.clocks[0], bool(schedules.scores_latency[0])
+    even = all(clock.is_even for clock in schedules.clocks)
+    return clock.ticks_per_ns, clock.frame_ticks, scored, even
+
+
+def _merged(
+    parts: Iterable[tuple[int, RunBatch]], frames: int
+) -> Iterator[list[tuple[int, RunBatch]]]:
+    """Groups, with their places, that are together about no larger than one may be."""
+    some: list[tuple[int, RunBatch]] = []
+    pending = 0
+    for place, part in parts:
+        size = int(part.schedules.lengths.sum()) + BESIDE * len(part)
+        if some and pending + size > frames:
+            yield some
+            some, pending = [], 0
+        some.append((place, part))
+        pending += size
+    if some:
+        yield some
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,17 +478,18 @@ def _absent(recording: Recording) -> int:
 class _Scoring:
     """How groups of runs are scored: the arguments of :func:`evaluate_groups`."""
 
-    metadata: Metadata
+    image_sizes: Callable[[Recording], ImageSizes | None]
     forecasters: Mapping[str, AnyFactory]
     sigmas: Sequence[Fraction]
     convention: Convention
     costs: Mapping[str, int]
-    curves_at: int
-    observers: Sequence[Observer]
-    observed: Collection[tuple[str, Fraction]]
+    curves_at: int = 0
+    observers: Sequence[Observer] = ()
+    observed: Collection[tuple[str, Fraction]] = ()
 
-    def of(self, runs: RunBatch, known: _Known) -> Evaluation:
-        """Score some runs of known recordings at once."""
+    def of(self, parts: Sequence[RunBatch], known: _Known) -> Iterator[Evaluation]:
+        """Score parts of known recordings at once; each as it is alone."""
+        runs = RunBatch.joined(parts)
         which = known.which(runs)
         offline = known.offline
         costs = {self.costs.get(name, 0) for name in self.forecasters}
@@ -421,23 +504,34 @@ class _Scoring:
             one = ScoredRun(run, kept[place], place, self.sigmas, pairings)
             for observer in self.observers:
                 observer(one)
-        return Evaluation(
-            replay=_replay_statistics(runs, offline, which),
-            staleness=Staleness.of(pairings[0]),
-            scores=scores,
-            failure=failure,
-            failure_time=np.where(failure < 0, -1.0, failed_at),
-            curves=Curves(
-                np.stack([each.success for each in scored]),
-                np.stack([each.precision for each in scored]),
-            ),
-            offline=dict(zip(METRICS, np.array([each.scores for each in offline])[which].T)),
-            offline_curves=Curves(
-                np.stack([each.success for each in offline])[which],
-                np.stack([each.precision for each in offline])[which],
-            ),
-            modelled=self._modelled(runs, known, scores),
+        replay = _replay_statistics(runs, offline, which)
+        staleness = Staleness.of(pairings[0])
+        failure_time = np.where(failure < 0, -1.0, failed_at)
+        curves, offline_curves = (
+            Curves(
+                np.stack([each.success for each in some]),
+                np.stack([each.precision for each in some]),
+            )
+            for some in (scored, offline)
         )
+        offline_scores = np.array([each.scores for each in offline])
+        outcomes = self._outcomes(runs, known, scores)
+        end = 0
+        for part in parts:
+            begin, end = end, end + len(part)
+            own = slice(begin, end)
+            of_part = {m: _piece(scores[m], own, 1) for m in METRICS}
+            yield Evaluation(
+                replay=replay.chosen(np.arange(begin, end)),
+                staleness=_pieces(staleness, own),
+                scores=of_part,
+                failure=_piece(failure, own, 1),
+                failure_time=_piece(failure_time, own, 1),
+                curves=_pieces(curves, own, 1),
+                offline=dict(zip(METRICS, offline_scores[which[own]].T)),
+                offline_curves=_pieces(offline_curves, which[own]),
+                modelled=modelled_scores(part, of_part, outcomes[own]),
+            )
 
     def _scored(
         self,
@@ -450,15 +544,15 @@ class _Scoring:
         which, scored = known.which(runs), []
         for name, factory in self.forecasters.items():
             pairing = pairings[self.costs.get(name, 0)]
-            parts = _answers(runs, self.metadata, pairing, name, factory)
+            parts = _answers(runs, self.image_sizes, pairing, name, factory)
             parts = self._observed(parts, pairing, name, kept)
             scored.append(known.scorer.of(which, parts, len(self.sigmas), self.curves_at))
         return scored
 
-    def _modelled(
+    def _outcomes(
         self, runs: RunBatch, known: _Known, recorded: Mapping[str, Floats]
-    ) -> ModelledScores:
-        """The scores under the search model; its outcomes are scored as runs are."""
+    ) -> list[dict[str, Floats]]:
+        """The scores of the search model's outcomes (see :func:`.modelled.modelled_scores`)."""
         scores: list[dict[str, Floats]] = [{} for _ in runs.modelled]
         others = []
         for s, outcomes in enumerate(runs.modelled):
@@ -477,7 +571,7 @@ class _Scoring:
             for i, (s, r, _) in enumerate(islice(places, len(group))):
                 for metric in MODELLED:
                     scores[s][metric][:, r] = [each.scores[metric][i] for each in scored]
-        return modelled_scores(runs, recorded, scores)
+        return scores
 
     def _observed(
         self,
@@ -549,7 +643,8 @@ def answers(
 ) -> Answers:
     """What a forecaster answers for every world frame of one run."""
     pairing = pair([run.schedule], [sigma], cost_ns)
-    (part,) = _answers(RunBatch.of([run]), metadata, pairing, name, factory)
+    sizes = metadata.image_sizes(run.recording.name)
+    (part,) = _answers(RunBatch.of([run]), lambda _: sizes, pairing, name, factory)
     ((_, only),) = _answers_at(0, pairing, part)
     return only
 
@@ -572,7 +667,7 @@ def lanes_of(
     runs: RunBatch,
     pairing: Pairing,
     fed: Histories,
-    metadata: Metadata | None,
+    image_sizes: Callable[[Recording], ImageSizes | None],
 ) -> Lanes:
     """What forecasters are fed in some histories of some runs.
 
@@ -580,7 +675,7 @@ def lanes_of(
         runs: those that were paired.
         pairing: of their schedules.
         fed: histories of the pairing.
-        metadata: of the trace, for the sizes of images; None = unknown.
+        image_sizes: of the sequence of a recording; None = unknown.
     """
     numbers = pairing.frames.take(fed.output)
     frames = pairing.frame_times(np.repeat(fed.sequence, np.diff(fed.offsets)), numbers)
@@ -589,7 +684,7 @@ def lanes_of(
     first = np.full((len(recordings), 2), np.inf)
     resized: dict[int, ImageSizes] = {}
     for k, recording in enumerate(recordings):
-        sizes = None if metadata is None else metadata.image_sizes(recording.name)
+        sizes = image_sizes(recording)
         if sizes is None:
             continue
         first[k] = sizes.at(0)
@@ -609,7 +704,7 @@ def lanes_of(
 
 def _answers(
     runs: RunBatch,
-    metadata: Metadata,
+    image_sizes: Callable[[Recording], ImageSizes | None],
     pairing: Pairing,
     name: str,
     factory: AnyFactory,
@@ -634,7 +729,7 @@ def _answers(
     factory_of = of_recording[which]
     for fed in histories(pairing, memoryless=defines(factory, "memoryless")).parts(_PART):
         paired = pairs(pairing, fed)
-        lanes = lanes_of(runs, pairing, fed, metadata)
+        lanes = lanes_of(runs, pairing, fed, image_sizes)
         frame: Ints | Floats = paired.frame
         number: Ints | None = None
         if lanes.numbers is not None:

@@ -56,7 +56,7 @@ class Examples:
         pairing = pair(batch.schedules, [Fraction(0)])
         fed = histories(pairing)
         queries = pairs(pairing, fed)
-        lanes = lanes_of(batch, pairing, fed, None)
+        lanes = lanes_of(batch, pairing, fed, lambda recording: None)
         ends = np.cumsum(pairing.lengths)
         sequence = fed.sequence.take(lanes.lane(queries.item))
         row = (ends - pairing.lengths)[sequence] + queries.frame

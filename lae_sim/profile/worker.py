@@ -25,7 +25,8 @@ from lae_sim.errors import LaeError, described, one_line
 from lae_sim.profile.timed import Answer, TrackerError
 from lae_sim.progress import tell
 from lae_sim.trackers.protocol import checked_frame
-from lae_sim.trackers.stopwatch import THREAD_VARIABLES, Stopwatch
+from lae_sim.trackers.runtimes import THREAD_VARIABLES
+from lae_sim.trackers.stopwatch import Stopwatch
 
 SERVE = Path(__file__).parents[1] / "trackers" / "serve.py"
 """The script of the process."""
@@ -262,13 +263,13 @@ class Worker(_Asked):
 class InProcess(_Asked):
     """A tracker in this process: a :class:`.timed.TimedTracker`, for ``with``, to debug a tracker.
 
-    Nothing stops it when it hangs or crashes, and the libraries keep the threads that they were
-    imported with, but for OpenCV and torch.
+    Nothing stops it when it hangs or crashes. BLAS and OpenMP keep the threads that they were
+    loaded with.
 
     Args:
         tracker: the tracker's name, see `lae_sim.trackers.names.make_tracker`.
         options: keyword arguments of its factory.
-        threads: threads that OpenCV and torch may use; None leaves them as they are.
+        threads: that libraries may use; None leaves them as they are.
 
     Raises:
         LaeError: if the tracker cannot be made.

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from itertools import chain, pairwise
+from itertools import chain, groupby, pairwise
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -25,7 +25,7 @@ from lae_sim.replay.passes import split_passes
 from lae_sim.replay.pipeline import PipelineTimes
 from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
-from lae_sim.trace.file import Trace
+from lae_sim.trace.file import HELD_FRAMES, Trace
 from lae_sim.trace.metadata import ImageSizes
 from lae_sim.trace.recording import BESIDE, Recording, batched
 
@@ -238,12 +238,16 @@ class Batched(Protocol):
 
 def grouped(runs: Iterable[Run], frames: int) -> Iterator[RunBatch]:
     """Runs in groups of about so many world frames, as :func:`.recording.batched` counts them."""
-    if not isinstance(runs, Batched):
-        yield from map(RunBatch.of, batched(runs, frames, BESIDE))
-        return
+    if isinstance(runs, Batched):
+        return regrouped(runs.batches(), frames)
+    return map(RunBatch.of, batched(runs, frames, BESIDE))
+
+
+def regrouped(batches: Iterable[RunBatch], frames: int) -> Iterator[RunBatch]:
+    """The same of runs in batches of any size."""
     parts: list[RunBatch] = []
     pending = 0
-    for batch in runs.batches():
+    for batch in batches:
         sizes = np.cumsum(batch.schedules.lengths + BESIDE)
         begin = before = 0
         while begin < len(batch):
@@ -273,6 +277,8 @@ class _Pass:
         if self.stride > 1:
             return followed(self.stride, len(self.recording))
         processed = ~np.isnan(self.recording.boxes[:, 0])
+        if processed.all():
+            return np.arange(-1, len(processed) - 1)
         latest_one = np.maximum.accumulate(np.where(processed, np.arange(len(processed)), -1))
         return np.concatenate([[-1], latest_one[:-1]])
 
@@ -523,30 +529,7 @@ class Runs:
 
     def batches(self) -> Iterator[RunBatch]:
         """The runs in batches, as many as are scheduled at once."""
-        for jobs, services in self._groups():
-            none = np.zeros(len(jobs), np.int64)
-            yield from _replayed(jobs, services, self.policy, none, self.pipeline)
-
-    def _groups(self) -> Iterator[tuple[list[_Job], list[Service]]]:
-        """Jobs with their services, as many as can be scheduled at once and be in memory.
-
-        A user's own policy or source sees one sequence after another: each is replayed before the
-        source is asked for the next.
-        """
-        jobs: list[_Job] = []
-        services: list[Service] = []
-        pending = 0
-        for job in self._jobs():
-            with explained("latency"):
-                service = self.source(job.times)
-            jobs.append(job)
-            services.append(service)
-            pending += len(job) + BESIDE
-            if pending >= _GROUP_FRAMES or not batchable([service], self.policy):
-                yield jobs, services
-                jobs, services, pending = [], [], 0
-        if jobs:
-            yield jobs, services
+        return (batch for _, batch in replay_together([self], _GROUP_FRAMES))
 
     def _jobs(self) -> Iterator[_Job]:
         """Each recording of the trace with those of the same name in the other traces."""
@@ -587,6 +570,65 @@ def check_rate(trace: Trace, fps: Fraction) -> None:
             f"frames/s: for {fps} frames/s forget the arrivals, and space the frames evenly: "
             "--forget-arrivals (forget_arrivals = true)"
         )
+
+
+def replay_together(
+    replays: Sequence[Runs], frames: int = HELD_FRAMES
+) -> Iterator[tuple[int, RunBatch]]:
+    """The runs of some replays, one after another; those of the same rules are scheduled at once.
+
+    Args:
+        replays: any of them.
+        frames: about how many world frames are in memory, and scheduled, at once.
+
+    Yields:
+        The place of a replay, and some of its runs.
+
+    Raises:
+        LaeError: as iterating over each of them.
+    """
+
+    def rules(placed: tuple[int, Runs]) -> tuple[Policy, PipelineTimes | None, Clock, bool]:
+        runs = placed[1]
+        return runs.policy, runs.pipeline, runs.clock, runs.arrivals == "recorded"
+
+    for (policy, pipeline, *_), alike in groupby(enumerate(replays), rules):
+        for places, jobs, services in _groups(alike, policy, frames):
+            none = np.zeros(len(jobs), np.int64)
+            for batch in _replayed(jobs, services, policy, none, pipeline):
+                begin = 0
+                for place, some in groupby(places[: len(batch)]):
+                    end = begin + sum(1 for _ in some)
+                    yield place, batch.part(begin, end)
+                    begin = end
+                del places[: len(batch)]
+
+
+def _groups(
+    replays: Iterable[tuple[int, Runs]], policy: Policy, frames: int
+) -> Iterator[tuple[list[int], list[_Job], list[Service]]]:
+    """Jobs with the places of their replays and with their services.
+
+    They are as many as can be scheduled at once and be in memory. A user's own policy or source
+    sees one sequence after another: each is replayed before the source is asked for the next.
+    """
+    places: list[int] = []
+    jobs: list[_Job] = []
+    services: list[Service] = []
+    pending = 0
+    for place, runs in replays:
+        for job in runs._jobs():
+            with explained("latency"):
+                service = runs.source(job.times)
+            places.append(place)
+            jobs.append(job)
+            services.append(service)
+            pending += len(job) + BESIDE
+            if pending >= frames or not batchable([service], policy):
+                yield places, jobs, services
+                places, jobs, services, pending = [], [], [], 0
+    if jobs:
+        yield places, jobs, services
 
 
 def replay_repeated(runs: Runs, count: int, first: int = 0) -> Iterator[tuple[int, Run]]:

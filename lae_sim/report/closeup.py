@@ -273,7 +273,7 @@ def close_ups(
     try:
         with explained("failed"):
             trace = held(read_trace(setting.trace.path, tuple(chosen)))
-            runs = {run.recording.name: run for run in reversed([*replayed(setting, trace).runs])}
+            runs = {run.recording.name: run for run in reversed([*replayed(setting, trace)])}
             costs = {cell.forecaster: cell.cost_ns for cell in view.results.plan.cells}
             sigma = setting.world.sigmas[0]
             answered = {

@@ -63,9 +63,15 @@ def _section(label: str, section: Any) -> list[str]:
     """A value of the metadata; the objects in it on lines of their own."""
     if not isinstance(section, dict):
         return [_entry(label, section)]
-    inner = {key: value for key, value in section.items() if isinstance(value, dict) and value}
+    inner = {key: value for key, value in section.items() if value and _has_keys(value)}
     lines = [_entry(label, {key: value for key, value in section.items() if key not in inner})]
     return lines + [_entry(f"  {key}", inner[key]) for key in inner if key != "readings"]
+
+
+def _has_keys(value: Any) -> bool:
+    """Whether it is an object, or a list of such."""
+    items = value if isinstance(value, list) else [value]
+    return all(isinstance(item, dict) for item in items)
 
 
 def _words(value: Any, depth: int = 0) -> str:
@@ -88,6 +94,8 @@ def _item(key: str, value: Any, depth: int) -> str:
         return name if value else f"not {name}"
     if key.endswith("_bytes") and isinstance(value, int) and abs(value) < 2**63:
         return f"{name[:-6]} {value / 2**30:.1f} GiB"
+    if key == "cpu_share" and isinstance(value, (int, float)):
+        return f"used {value:.2g} cores"
     words = _words(value, depth + 1)
     return words if key in _UNNAMED else f"{name} {words}"
 

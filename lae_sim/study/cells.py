@@ -7,10 +7,11 @@ again, and one whose input has changed is not. Cells of the same replay are comp
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from itertools import chain, groupby
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from lae_sim import __version__
 from lae_sim._arrays import Floats
 from lae_sim.engine.lanes import batchable
 from lae_sim.evaluation.caveats import notes_on
-from lae_sim.evaluation.evaluate import ReplayStatistics, evaluate_groups
+from lae_sim.evaluation.evaluate import Evaluation, ReplayStatistics, evaluate_together
 from lae_sim.evaluation.metrics import find_convention
 from lae_sim.evaluation.modelled import MODELLED, over_sigmas
 from lae_sim.evaluation.totals import CurveTotals, ModelledTotals
@@ -29,12 +30,12 @@ from lae_sim.forecast.costs import cost_notes
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import RandomSource
 from lae_sim.replay.names import kind_of, label_of
-from lae_sim.replay.run import Repetitions, Run
+from lae_sim.replay.run import Repetitions, Run, RunBatch, Runs, replay_together
 from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import World
 from lae_sim.study.rows import CellRows, RowsFile
 from lae_sim.study.spec import is_random
-from lae_sim.trace.file import Trace, held, read_trace
+from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
 
 VERSION = 6
@@ -225,79 +226,129 @@ class Result:
     about: dict[str, Any]
 
 
-def compute(task: Task, trace: Trace | None = None, shared: RowsFile | None = None) -> list[Result]:
-    """Replay once for each convention, and score.
+def compute(
+    tasks: Sequence[Task], traces: Sequence[Trace], shared: RowsFile | None = None
+) -> list[list[Result]]:
+    """Replay once for each convention, and score; small tasks at once.
 
     Args:
-        task: what to do.
-        trace: the task's, where it has been read; by default it is read here.
+        tasks: what to do; with several, all are of held traces.
+        traces: the trace of each.
         shared: the file that the rows go to; by default each cell has its own.
+
+    Returns:
+        The results of each task.
 
     Raises:
         LaeError: whatever replaying and scoring raise.
     """
-    setting = task.cells[0].setting
-    if trace is None:
-        trace = held(read_trace(setting.trace.path, setting.sequences or None))
-    conventions = dict.fromkeys(cell.convention for cell in task.cells)
-    return [
-        result
-        for convention in conventions
-        for result in _computed(
-            [cell for cell in task.cells if cell.convention == convention],
-            task.factories,
-            trace,
-            shared,
-        )
-    ]
-
-
-def _computed(
-    cells: Sequence[Cell],
-    factories: Mapping[str, AnyFactory],
-    trace: Trace,
-    shared: RowsFile | None,
-) -> list[Result]:
-    """The results of cells of one setting and one convention."""
-    setting = cells[0].setting
-    world, convention = setting.world, find_convention(cells[0].convention)
-    chosen = {cell.forecaster: factories[cell.forecaster] for cell in cells}
-    costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
-    writers = [CellRows(world.sigmas, cell.about(trace.metadata), shared) for cell in cells]
-    replay = replayed(setting, trace)
-    curves, modelled, kept = CurveTotals(), ModelledTotals(0), []
-    departures = calls = 0
-    for part in evaluate_groups(
-        replay.runs, trace.metadata, chosen, world.sigmas, convention, costs=costs, frames=GROUP
-    ):
-        of_part = part.replay.repetition.astype(np.int32)
-        for f, writer in enumerate(writers):
-            writer.add(part, f, of_part)
-        curves.add(part)
-        modelled.add(part)
-        departures += int(part.replay.departures.sum())
-        calls += int((part.replay.processed - 1).sum())
-        kept.append(part.replay.chosen(np.flatnonzero(of_part == setting.first)))
-    about = ReplayStatistics.joined(kept)
-    results = []
-    for f, (cell, writer) in enumerate(zip(cells, writers)):
-        only = {cell.forecaster: chosen[cell.forecaster]}
-        details = {
-            "engine": replay.engine,
-            "repetitions": setting.count,
-            "curves": _curves(curves, f),
-            "approximate_outputs": departures,
-            "calls": calls,
-            "init_source": world.init_source(replay.times),
-            "modelled": _modelled(modelled, f, replay.search),
-            "notes": [
-                *notes_on(about, trace.metadata, convention, only),
-                *replay.notes,
-                *cost_notes({cell.forecaster: cell.cost_ns} if cell.cost_ns else {}),
-            ],
-        }
-        results.append(Result(cell.key, *writer.finish(), details))
+    shares: list[_Share] = []
+    for place, (task, trace) in enumerate(zip(tasks, traces)):
+        for convention in dict.fromkeys(cell.convention for cell in task.cells):
+            cells = [cell for cell in task.cells if cell.convention == convention]
+            shares.append(_Share(place, cells, task.factories, trace, shared))
+    alike: dict[Any, list[_Share]] = {}
+    for share in shares:
+        alike.setdefault(share.way, []).append(share)
+    for some in alike.values():
+        _score(some)
+    results: list[list[Result]] = [[] for _ in tasks]
+    for share in shares:
+        results[share.place] += share.results()
     return results
+
+
+def _score(shares: Sequence[_Share]) -> None:
+    """Score what is scored in the same way."""
+    first = shares[0]
+    for place, part in evaluate_together(
+        _runs(shares),
+        [share.trace.metadata for share in shares],
+        first.factories,
+        first.setting.world.sigmas,
+        first.convention,
+        costs=first.costs,
+        frames=GROUP,
+    ):
+        shares[place].add(part)
+
+
+def _runs(shares: Sequence[_Share]) -> Iterator[tuple[int, RunBatch]]:
+    """The runs of each share, with its place."""
+    for repeats, some in groupby(enumerate(shares), lambda each: each[1].replay.repeats):
+        places, own = zip(*some)
+        replays = [share.replay for share in own]
+        if repeats:
+            for place, replay in zip(places, replays):
+                yield from ((place, batch) for batch in replay.batches())
+        else:
+            for i, batch in replay_together([replay.runs for replay in replays]):
+                yield places[i], batch
+
+
+class _Share:
+    """The cells of one setting and one convention, and what is known of them so far."""
+
+    def __init__(
+        self,
+        place: int,
+        cells: Sequence[Cell],
+        factories: Mapping[str, AnyFactory],
+        trace: Trace,
+        shared: RowsFile | None,
+    ) -> None:
+        self.place, self.cells, self.trace = place, cells, trace
+        self.setting = cells[0].setting
+        self.convention = find_convention(cells[0].convention)
+        self.factories = {cell.forecaster: factories[cell.forecaster] for cell in cells}
+        self.costs = {cell.forecaster: cell.cost_ns for cell in cells if cell.cost_ns}
+        self.replay = replayed(self.setting, trace)
+        sigmas = self.setting.world.sigmas
+        self._writers = [CellRows(sigmas, cell.about(trace.metadata), shared) for cell in cells]
+        self._curves, self._modelled = CurveTotals(), ModelledTotals(0)
+        self._kept: list[ReplayStatistics] = []
+        self._departures = self._calls = 0
+
+    @property
+    def way(self) -> tuple[Any, ...]:
+        """Shares that differ in it cannot be scored at once."""
+        made = tuple((name, id(factory)) for name, factory in self.factories.items())
+        return self.convention.name, self.setting.world.sigmas, made, tuple(self.costs.items())
+
+    def add(self, part: Evaluation) -> None:
+        """Take in what was scored of some runs."""
+        repetitions = part.replay.repetition.astype(np.int32)
+        for f, writer in enumerate(self._writers):
+            writer.add(part, f, repetitions)
+        self._curves.add(part)
+        self._modelled.add(part)
+        self._departures += int(part.replay.departures.sum())
+        self._calls += int((part.replay.processed - 1).sum())
+        first = np.flatnonzero(repetitions == self.setting.first)
+        self._kept.append(part.replay.chosen(first))
+
+    def results(self) -> list[Result]:
+        """The results of the cells."""
+        about, metadata = ReplayStatistics.joined(self._kept), self.trace.metadata
+        results = []
+        for f, (cell, writer) in enumerate(zip(self.cells, self._writers)):
+            only = {cell.forecaster: self.factories[cell.forecaster]}
+            details = {
+                "engine": self.replay.engine,
+                "repetitions": self.setting.count,
+                "curves": _curves(self._curves, f),
+                "approximate_outputs": self._departures,
+                "calls": self._calls,
+                "init_source": self.setting.world.init_source(self.replay.runs.times.metadata),
+                "modelled": _modelled(self._modelled, f, self.replay.runs.search),
+                "notes": [
+                    *notes_on(about, metadata, self.convention, only),
+                    *self.replay.runs.notes(),
+                    *cost_notes({cell.forecaster: cell.cost_ns} if cell.cost_ns else {}),
+                ],
+            }
+            results.append(Result(cell.key, *writer.finish(), details))
+        return results
 
 
 def _curves(totals: CurveTotals, f: int) -> dict[str, list[float] | None]:
@@ -340,21 +391,31 @@ def _distinct(draws: Floats) -> list[list[float]]:
 
 @dataclass(frozen=True)
 class Replayed:
-    """The runs of a setting.
+    """The replay of a setting.
 
     Attributes:
-        runs: of all repetitions.
+        setting: which trace, and how.
+        runs: its runs, of random times those of one repetition.
         engine: ``"batch"``, or ``"simpy"`` where the policy or the source of times knows no lanes.
-        times: metadata of the trace that the times are from.
-        search: the model of where the tracker finds its target; None if there is none.
-        notes: on when frames arrive.
     """
 
-    runs: Iterable[Run]
+    setting: Setting
+    runs: Runs
     engine: str
-    times: Metadata
-    search: SearchModel | None
-    notes: list[str]
+
+    @property
+    def repeats(self) -> bool:
+        """Whether times are random, so that they may be drawn again and again."""
+        return isinstance(self.runs.source, RandomSource)
+
+    def __iter__(self) -> Iterator[Run]:
+        return chain.from_iterable(self.batches())
+
+    def batches(self) -> Iterator[RunBatch]:
+        """All runs, repetition after repetition."""
+        if self.repeats:
+            return Repetitions(self.runs, self.setting.count, self.setting.first).batches()
+        return self.runs.batches()
 
 
 def replayed(setting: Setting, trace: Trace) -> Replayed:
@@ -369,8 +430,4 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
     runs = setting.world.replay(trace, pre_forecaster=searches)
     times = runs.source(next(iter(runs.times)))
     in_lanes = batchable([times], runs.policy) and runs.arrivals != "recorded"
-    made: Iterable[Run] = runs
-    if isinstance(runs.source, RandomSource):
-        made = Repetitions(runs, setting.count, setting.first)
-    engine = "batch" if in_lanes else "simpy"
-    return Replayed(made, engine, runs.times.metadata, runs.search, runs.notes())
+    return Replayed(setting, runs, "batch" if in_lanes else "simpy")

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from lae_sim.comparison.pairs import Member, Pairs, pairs_of
 from lae_sim.comparison.statistics import RESAMPLES, Difference, Interval
 from lae_sim.evaluation.modelled import Ranking
 from lae_sim.files import text_digest, written_whole
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.study.pairs import Member, Pairs, pairs_of
 from lae_sim.study.records import MEAN, Comparison
 from lae_sim.study.summary import Scores, ranked
 from lae_sim.trace.columns import from_numpy, from_texts, to_numpy

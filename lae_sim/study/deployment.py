@@ -186,7 +186,7 @@ def mean_auc(search: Search, scale: Fraction, trace: Trace) -> tuple[float, floa
     cell = search.cell
     setting = replace(cell.setting, world=replace(cell.setting.world, scale=scale))
     groups = evaluate_groups(
-        replayed(setting, trace).runs,
+        replayed(setting, trace),
         trace.metadata,
         {cell.forecaster: search.factory},
         setting.world.sigmas,

@@ -6,6 +6,7 @@ import io
 import os
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +160,7 @@ class CellRows:
         values["sigma"] = np.tile(self._sigmas, len(replay.sequences))
         rows = len(values["sigma"])
         columns = {
-            **{name: from_texts([text], rows) for name, text in self._about.items()},
+            **{name: pa.repeat(text, rows) for name, text in self._about.items()},
             "sequence": from_texts(replay.sequences, count),
             **{name: from_numpy(column.astype(COLUMNS[name])) for name, column in values.items()},
         }
@@ -189,6 +190,7 @@ def _modelled(part: Evaluation, f: int) -> dict[str, Floats]:
     }
 
 
+@cache
 def _schema() -> Any:
     import pyarrow as pa
 

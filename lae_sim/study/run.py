@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from lae_sim import __version__
 from lae_sim._compiled import amount
+from lae_sim.comparison.pairs import Pairs
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.caveats import at_the_floor, floor_notes
 from lae_sim.files import check_distinct, csv_cell, text_digest, written_whole
@@ -26,7 +27,6 @@ from lae_sim.study.cells import Result, Task
 from lae_sim.study.comparisons import PairsFile, Rivals, rivals_of
 from lae_sim.study.deployment import Curve, Search, requirement, searches
 from lae_sim.study.executors import RunAll, at_work, cores, run_here
-from lae_sim.study.pairs import Pairs
 from lae_sim.study.plan import Plan, make_plan, tasks
 from lae_sim.study.records import MEAN, Comparison, Failure, Record, Requirement, SummaryRow
 from lae_sim.study.spec import Study
@@ -39,7 +39,16 @@ from lae_sim.study.summary import (
 )
 from lae_sim.study.uncertainty import Answers, Resamples
 from lae_sim.study.verdict import verdict
-from lae_sim.study.work import Batch, Description, Done, Work, attempt, attempt_batch, batches
+from lae_sim.study.work import (
+    Batch,
+    Description,
+    Done,
+    Work,
+    attempt,
+    attempt_batch,
+    batches,
+    seconds,
+)
 from lae_sim.trace.describe import is_measured
 from lae_sim.trace.locate import digest
 
@@ -58,6 +67,10 @@ ANSWERS = "answers"
 
 FEW = 30_000
 """Pairs, counted twice, that are sooner compared here than handed to workers."""
+
+
+ALONE = 1.0
+"""Seconds of work for which no other process is started: that alone takes half of it."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -267,7 +280,8 @@ def compute_study(
         study: what is asked for.
         folder: where results are kept; finished cells found there are not computed again.
         base: the folder that relative paths of traces are from; the current one by default.
-        workers: processes on this machine; by default one for each core. No result depends on it.
+        workers: processes on this machine; by default one for each core, or this one alone where
+            there is little to do. No result depends on it.
         scheduler: address of a Dask cluster to compute on instead, such as ``tcp://host:8786``;
             its workers must see the traces under the same paths.
         progress: told what is going on, how much of it is done, and of how much.
@@ -328,7 +342,9 @@ def _run(
     ]
     frames = {source.input: source.frames for source in plan.sources}
     pieces = [*batches(works, frames)]
-    workers = min(workers or cores(), max(len(pieces), 1))
+    if workers is None:
+        workers = cores() if seconds(works, frames) > ALONE else 1
+    workers = min(workers, max(len(pieces), 1))
     share = sum(
         amount(frames[cell.setting.trace] * cell.setting.count, len(study.sigmas)) for cell in cells
     )

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import chain
 from typing import Any, TypeAlias
 
 from lae_sim import __version__
@@ -44,6 +43,7 @@ BATCH = 1 << 16
 """World frames that small pieces of work come to together, about, each as often as it is scored."""
 
 _TRIED = 60  # scales, in a search
+_EACH, _FRAME = 1.5e-3, 0.35e-6  # seconds that a piece takes, and a frame each time it is scored
 
 
 @dataclass(frozen=True)
@@ -82,15 +82,23 @@ def batches(works: Iterable[Work], frames: Mapping[Input, int]) -> Iterator[Batc
         by_trace.setdefault(_inputs(work)[0], []).append(work)
     together: list[Work] = []
     cost = 0
-    for work in chain.from_iterable(by_trace.values()):
-        own = frames[_inputs(work)[0]] * _times_scored(work)
-        if together and cost + own > BATCH:
-            yield Batch(tuple(together))
-            together, cost = [], 0
-        together.append(work)
-        cost += own
+    for trace, some in by_trace.items():
+        first = 2 if isinstance(some[0], Description) else 1  # with what it is read for anyway
+        for unit in (some[:first], *([work] for work in some[first:])):
+            own = sum(frames[trace] * _times_scored(work) for work in unit)
+            if together and cost + own > BATCH:
+                yield Batch(tuple(together))
+                together, cost = [], 0
+            together += unit
+            cost += own
     if together:
         yield Batch(tuple(together))
+
+
+def seconds(works: Iterable[Work], frames: Mapping[Input, int]) -> float:
+    """How long work takes in one process, about: of the same order, wherever that is."""
+    scored = (frames[_inputs(work)[0]] * _times_scored(work) for work in works)
+    return sum(_EACH + _FRAME * each for each in scored)
 
 
 def _times_scored(work: Work) -> int:
@@ -112,22 +120,41 @@ def attempt_batch(batch: Batch, share: int = 0) -> Done:
     tasks = [work for work in batch.works if isinstance(work, Task)]
     shared = RowsFile() if len(tasks) > 1 else None
     traces = _Traces()
-    found = tuple([attempt(work, traces, shared) for work in batch.works])
+    together = _together(tasks, traces, shared) if shared is not None else {}
+    found = tuple(
+        together[id(work)] if id(work) in together else attempt(work, traces, shared)
+        for work in batch.works
+    )
     return Done(found, b"" if shared is None else shared.finish())
 
 
+def _together(tasks: Sequence[Task], traces: _Traces, shared: RowsFile) -> dict[int, list[Result]]:
+    """The results of tasks by their identities; nothing where one fails, so that each is alone."""
+    before = shared.rows
+    try:
+        with explained("failed"):
+            for task in tasks:
+                _check(task)
+            settings = [task.cells[0].setting for task in tasks]
+            read = [traces.read(each.trace, each.sequences) for each in settings]
+            return dict(zip(map(id, tasks), compute(tasks, read, shared)))
+    except LaeError:
+        shared.undo(before)
+        return {}
+
+
 class _Traces:
-    """The trace that was read last."""
+    """The traces that have been read, for the pieces of work of a batch."""
 
     def __init__(self) -> None:
-        self._key: object = None
+        self._read: dict[tuple[Input, tuple[str, ...]], Trace] = {}
 
     def read(self, trace: Input, sequences: tuple[str, ...]) -> Trace:
-        """A trace, once for pieces of work that come one after another."""
-        if self._key != (trace, sequences):
-            self._trace = held(read_trace(trace.path, sequences or None))
-            self._key = trace, sequences
-        return self._trace
+        """A trace, which is read once."""
+        key = trace, sequences
+        if key not in self._read:
+            self._read[key] = held(read_trace(trace.path, sequences or None))
+        return self._read[key]
 
 
 def attempt(work: Work, traces: _Traces | None = None, shared: RowsFile | None = None) -> Any:
@@ -144,12 +171,17 @@ def attempt(work: Work, traces: _Traces | None = None, shared: RowsFile | None =
     """
     try:
         with explained("failed"):
-            for trace in _inputs(work):
-                if stamp(trace.path) != trace.stamp and digest(trace.path) != trace.digest:
-                    raise LaeError(f"{trace.path}: changed since the study began: run it again")
+            _check(work)
             return _performed(work, traces or _Traces(), shared)
     except LaeError as error:
         return Failure(work_in_words(work), str(error))
+
+
+def _check(work: Work) -> None:
+    """Check that the files are as they were when the study was planned."""
+    for trace in _inputs(work):
+        if stamp(trace.path) != trace.stamp and digest(trace.path) != trace.digest:
+            raise LaeError(f"{trace.path}: changed since the study began: run it again")
 
 
 def _performed(work: Work, traces: _Traces, shared: RowsFile | None) -> Any:
@@ -170,7 +202,7 @@ def _cell_by_cell(task: Task, trace: Trace, shared: RowsFile | None) -> list[Res
     before = 0 if shared is None else shared.rows
     try:
         with explained("failed"):
-            return list(compute(task, trace, shared))
+            return [*compute([task], [trace], shared)[0]]
     except LaeError as error:
         if shared is not None:
             shared.undo(before)

@@ -197,7 +197,7 @@ def drift(sequences: Sequence[SequenceTimes]) -> dict[str, Any]:
     # how often a value of the last third exceeds one of the first, ties counting half
     wins = sum(np.searchsorted(first, last, side).sum() / 2 for side in ("left", "right"))
     z = (wins - third**2 / 2) / math.sqrt(third**2 * (2 * third + 1) / 12)
-    ratio = float(np.median(last) / max(np.median(first), 1e-6))
+    ratio = _median(last) / max(_median(first), 1e-6)
     return {
         "tenths_ms": _medians(np.array_split(run, 10)).tolist(),
         "ratio": ratio,
@@ -210,21 +210,21 @@ def first_calls(sequences: Sequence[SequenceTimes]) -> dict[str, float]:
     times = [sequence.elapsed_ns for sequence in sequences if len(sequence.elapsed_ns) > 1]
     if not times:
         return {}
-    ratios = [part[0] / max(np.median(part[1:]), 1) for part in times]
+    ratios = [part[0] / max(_median(part[1:]), 1.0) for part in times]
     return {
-        "median_ms": float(np.median([part[0] for part in times])) / 1e6,
-        "ratio": float(np.median(ratios)),
+        "median_ms": _median(np.array([part[0] for part in times])) / 1e6,
+        "ratio": _median(np.array(ratios)),
     }
 
 
 def stalls(sequences: Sequence[SequenceTimes]) -> list[dict[str, Any]]:
     """Calls that took over ten times the median of the run and of their sequence, longest first."""
     times = [sequence.elapsed_ns for sequence in sequences]
-    middle = np.median(np.concatenate(times)) if sum(map(len, times)) else 0
+    middle = _median(np.concatenate(times)) if sum(map(len, times)) else 0
     longer = []
     for sequence in sequences:
         ns = sequence.elapsed_ns
-        for call in np.flatnonzero(ns > STALL * max(middle, np.median(ns) if len(ns) else 0)):
+        for call in np.flatnonzero(ns > STALL * max(middle, _median(ns) if len(ns) else 0)):
             stall = {"sequence": sequence.name, "frame": int(sequence.frames[call])}
             longer.append({**stall, "ms": int(ns[call]) / 1e6, "first_call": bool(call == 0)})
     return sorted(longer, key=lambda stall: -stall["ms"])
@@ -232,7 +232,14 @@ def stalls(sequences: Sequence[SequenceTimes]) -> list[dict[str, Any]]:
 
 def _medians(parts: Sequence[Any]) -> Floats:
     """Medians of arrays of ns, ms."""
-    return np.array([np.median(part) for part in parts]) / 1e6
+    return np.array([_median(part) for part in parts]) / 1e6
+
+
+def _median(values: npt.NDArray[Any]) -> float:
+    """What ``np.median`` is of some numbers, five times as fast where they are few."""
+    middle = (len(values) - 1) // 2, len(values) // 2
+    low, high = np.partition(values, middle)[[*middle]].tolist()
+    return (float(low) + float(high)) / 2
 
 
 Facts = dict[str, Any]
@@ -365,11 +372,20 @@ def _warnings(report: Report, metadata: Metadata) -> Iterator[str]:
     taken = device.get("readings", {})
     warnings = gathered(  # whatever another program wrote there
         busy=lambda: _busy(taken["before"]["load"][0], device["cpu"]),
+        threads=lambda: _beyond(metadata.document["timing"]),
         throttled=lambda: throttling(
             taken.get("before", {}), taken.get("during", []), taken.get("after", {})
         ),
     )
     yield from warnings.values()
+
+
+def _beyond(timing: Mapping[str, Any]) -> str | None:
+    """Whether the tracker used more cores than it was asked to."""
+    asked, used = timing["threads"]["asked"], timing["cpu_share"]
+    if used <= 1.1 * asked:
+        return None
+    return f"--threads {asked} was not obeyed by all libraries: {used:.2g} cores were busy"
 
 
 def _busy(load: float, cpu: Mapping[str, Any]) -> str | None:

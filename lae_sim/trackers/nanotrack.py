@@ -1,4 +1,4 @@
-"""NanoTrack, driven through OpenCV's network module from its two ONNX files.
+"""NanoTrack, driven from its two ONNX files by OpenCV's network module or ONNX Runtime.
 
 NanoTrack (H. Chu, the NanoTrack folder of https://github.com/HonglinChu/SiamTrackers) is a Siamese
 tracker: a small backbone, a depth-wise correlation, and a head that for each point of a grid says
@@ -9,14 +9,15 @@ Li et al., SiamRPN++, CVPR 2019.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, listed
+from lae_sim.trackers.onnx import onnx_session
 from lae_sim.trackers.protocol import (
     Array,
     Image,
@@ -35,6 +36,15 @@ SMALLEST = 10.0  # pixels, of a side of an answer
 # influence of the cosine window, rate at which the size follows. (Version 1 looks like 2.)
 _VERSIONS = {16: ("v2", 0.150, 0.490, 0.385), 15: ("v3", 0.138, 0.455, 0.348)}
 
+_RUNTIMES = ("opencv", "onnxruntime")
+_NO_DEVICE = "nanotrack: the device {!r} is neither 'cpu' nor 'cuda:NUMBER'"
+_PROVIDERS = {"": "CPU", "cpu": "CPU", "cuda": "CUDA"}  # of ONNX Runtime, for a kind of device
+
+if TYPE_CHECKING:
+    # features of a patch [1, 3, side, side]; and of those of template and patch, classes
+    # [1, 2, n, n] and sides [1, 4, n, n]
+    Networks = tuple[Callable[[Array], Array], Callable[[Array, Array], Sequence[Array]]]
+
 _UPSTREAM = "they are in NanoTrack/models of https://github.com/HonglinChu/SiamTrackers"
 
 
@@ -44,29 +54,54 @@ class NanoTrack:
     Args:
         weights: folder of the two files ``*backbone*.onnx`` and ``*head*.onnx``.
         backbone, head: the two files themselves, instead.
-        device: ``"cpu"``, or ``"cuda:0"`` where OpenCV was built with CUDA.
+        device: ``"cpu"``, or ``"cuda:0"`` where OpenCV was built with CUDA, or with a provider of
+            a GPU.
+        runtime: ``"opencv"`` or ``"onnxruntime"``.
+        provider, cpu_nodes, cache: of ONNX Runtime, see `lae_sim.trackers.onnx.onnx_session`.
 
     Raises:
         LaeError: if a file is missing or not of NanoTrack, or the device cannot be used.
     """
 
     def __init__(
-        self, weights: str = "", backbone: str = "", head: str = "", device: str = "cpu"
+        self,
+        weights: str = "",
+        backbone: str = "",
+        head: str = "",
+        device: str = "",
+        runtime: str = "opencv",
+        provider: str = "",
+        cpu_nodes: bool = False,
+        cache: str = "",
     ) -> None:
+        if runtime not in _RUNTIMES:
+            raise LaeError(f"nanotrack: no runtime {runtime!r}: there are {listed(_RUNTIMES)}")
+        if provider and runtime == "opencv":
+            raise LaeError("nanotrack: provider is of ONNX Runtime: add runtime=onnxruntime")
         paths = [_find(weights, "backbone", backbone), _find(weights, "head", head)]
-        self._backbone, self._head = (_network(path, device) for path in paths)
-        self._device = device
-        self._digest = weights_digest(*paths)
+        self._settings: dict[str, Any] = {"runtime": runtime}
+        wrong = (
+            " and ".join(map(str, paths)) + " are not a backbone and a head of NanoTrack v2 or v3"
+        )
         try:
-            self._template = self._features(np.zeros((TEMPLATE, TEMPLATE, 3), np.uint8)).copy()
+            if runtime == "opencv":
+                self._settings["device"] = device or "cpu"
+                self._backbone, self._head = _opencv(paths, device or "cpu")
+            else:
+                usual, number = _gpu(device)
+                self._settings["provider"] = provider = provider or usual
+                self._backbone, self._head = _onnx(
+                    paths, provider=provider, device=number, cpu_nodes=cpu_nodes, cache=cache
+                )
+            self._template = self._features(np.zeros((TEMPLATE, TEMPLATE, 3), np.uint8))
             scores, _ = self._correlate(np.zeros((SEARCH, SEARCH, 3), np.uint8))
             count = scores.shape[-1]
             self._version, self._penalty, self._influence, self._rate = _VERSIONS[count]
-        except (cv2.error, KeyError, ValueError) as error:
-            names = " and ".join(str(path) for path in paths)
-            raise LaeError(
-                f"{names} are not a backbone and a head of NanoTrack v2 or v3"
-            ) from error
+        except LaeError:
+            raise
+        except Exception as error:  # of OpenCV or ONNX Runtime, which has types of its own
+            raise LaeError(wrong) from error
+        self._digest = weights_digest(*paths)
         window = np.hanning(count)
         self._window = np.outer(window, window)
         self._points = STRIDE * (np.arange(count) - count // 2.0)
@@ -84,7 +119,7 @@ class NanoTrack:
         self._mean = cv2.mean(frame)
         with stage("preprocess"):
             patch = self._crop(frame, round(self._context_side()), TEMPLATE)
-        self._template = self._features(patch).copy()
+        self._template = self._features(patch)
         self._started = True
 
     def set_search(self, cx: float, cy: float, w: float, h: float) -> None:
@@ -141,7 +176,7 @@ class NanoTrack:
             "name": "nanotrack",
             "version": self._version,
             "settings": {
-                "device": self._device,
+                **self._settings,
                 "penalty_k": self._penalty,
                 "window_influence": self._influence,
                 "lr": self._rate,
@@ -174,16 +209,13 @@ class NanoTrack:
         with stage("preprocess"):
             blob = cv2.dnn.blobFromImage(patch)
         with stage("inference"):
-            self._backbone.setInput(blob)
-            return np.asarray(self._backbone.forward(), np.float32)
+            return self._backbone(blob)
 
     def _correlate(self, patch: Image) -> tuple[Array, Array]:
         """Probability [n, n], and distances left, top, right, bottom [4, n, n], pixels of patch."""
         features = self._features(patch)
         with stage("inference"):
-            self._head.setInput(self._template, "input1")
-            self._head.setInput(features, "input2")
-            (classes,), (sides,) = self._head.forward(["output1", "output2"])
+            (classes,), (sides,) = self._head(self._template, features)
         with stage("postprocess"):
             background, target = classes.astype(np.float64)
             return 1 / (1 + np.exp(np.clip(background - target, -500, 500))), sides
@@ -212,6 +244,49 @@ def _find(folder: str, part: str, given: str) -> Path:
     return files[0]
 
 
+def _opencv(paths: Sequence[Path], device: str) -> Networks:
+    backbone, head = (_network(path, device) for path in paths)
+
+    def features(patch: Array) -> Array:
+        backbone.setInput(patch)
+        return np.array(backbone.forward(), np.float32)  # its own memory, which it uses again
+
+    def correlated(template: Array, search: Array) -> Sequence[Array]:
+        head.setInput(template, "input1")
+        head.setInput(search, "input2")
+        found: Sequence[Array] = head.forward(["output1", "output2"])
+        return found
+
+    return features, correlated
+
+
+def _onnx(paths: Sequence[Path], **options: Any) -> Networks:
+    """The backbone, exported for the search's pixels alone, is loaded for the template's too."""
+    sides = TEMPLATE, SEARCH
+    shapes = {side: {"input": (1, 3, side, side)} for side in sides}
+    backbones = {side: onnx_session(paths[0], shapes=shapes[side], **options) for side in sides}
+    head = onnx_session(paths[1], **options)
+
+    def features(patch: Array) -> Array:
+        found: Sequence[Array] = backbones[patch.shape[-1]].run(None, {"input": patch})
+        return found[0]
+
+    def correlated(template: Array, search: Array) -> Sequence[Array]:
+        inputs = {"input1": template, "input2": search}
+        found: Sequence[Array] = head.run(["output1", "output2"], inputs)
+        return found
+
+    return features, correlated
+
+
+def _gpu(device: str) -> tuple[str, int]:
+    """ONNX Runtime's provider for a device, and the number of the GPU."""
+    name, _, number = device.partition(":")
+    if name not in _PROVIDERS or not (number or "0").isdigit():
+        raise LaeError(_NO_DEVICE.format(device))
+    return _PROVIDERS[name], int(number or 0)
+
+
 def _network(path: Path, device: str) -> Any:
     try:
         network = cv2.dnn.readNet(str(path))
@@ -226,5 +301,5 @@ def _network(path: Path, device: str) -> Any:
         network.setPreferableBackend(backend)
         network.setPreferableTarget(target)
     elif device != "cpu":
-        raise LaeError(f"nanotrack: the device {device!r} is neither 'cpu' nor 'cuda:NUMBER'")
+        raise LaeError(_NO_DEVICE.format(device))
     return network

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +13,7 @@ from typing import Any
 from lae_sim.errors import LaeError, shown
 from lae_sim.trackers.names import make_tracker
 from lae_sim.trackers.protocol import Image
+from lae_sim.trackers.runtimes import Runtimes
 from lae_sim.trackers.stages import listening
 
 LARGEST = 1e9
@@ -21,11 +21,6 @@ LARGEST = 1e9
 
 LARGEST_SCORE = 3.4e38
 """Of a float32, in which traces hold scores."""
-
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""The environment variables that libraries read when they are imported."""
-
-_LIBRARIES = ("numpy", "scipy", "cv2", "torch", "torchvision", "onnxruntime", "tensorrt")
 
 
 class Stopwatch:
@@ -39,7 +34,7 @@ class Stopwatch:
     Args:
         tracker: the name, see `make_tracker`.
         options: keyword arguments of its factory.
-        threads: threads that OpenCV and torch may use; None leaves them as they are.
+        threads: that libraries may use, see `.runtimes.Runtimes`; None leaves them as they are.
 
     Attributes:
         sets_search: whether the tracker can be told where to search.
@@ -53,7 +48,14 @@ class Stopwatch:
     def __init__(
         self, tracker: str, options: Mapping[str, Any], threads: int | None = None
     ) -> None:
-        self._threads = threads
+        self._runtimes = Runtimes(threads)
+        try:
+            self._set_up(tracker, options)
+        except BaseException:
+            self._runtimes.close()
+            raise
+
+    def _set_up(self, tracker: str, options: Mapping[str, Any]) -> None:
         self._tracker: Any = make_tracker(tracker, options)
         for name in ("init", "track"):
             if not callable(getattr(self._tracker, name, None)):
@@ -63,14 +65,14 @@ class Stopwatch:
         self._sync: Callable[[], object] = getattr(self._tracker, "sync", _cuda_at_rest)
         self._started = False
         self.sets_search = hasattr(self._tracker, "set_search")
-        self._limit_threads()
+        self._runtimes.limit()
 
     def init(self, frame: Image, box: Sequence[float]) -> dict[str, Any]:
         """Start on a new sequence; what is answered has the fields of `.timed.Answer`."""
         self._started = False
         getattr(self._tracker, "prepare", int)()
         _, times = self._timed(self._tracker.init, frame.copy(), box)
-        self._limit_threads()  # for libraries that the tracker imports only now
+        self._runtimes.limit()  # for libraries that the tracker imports only now
         self._started = True
         return {"box": list(box), "score": None, **times}
 
@@ -94,17 +96,28 @@ class Stopwatch:
         description = {
             **own,
             "python": platform.python_version(),
-            "libraries": {**_versions(), **own.get("libraries", {})},
-            "threads": _threads(),
-            "synchronised": self._sync is not _cuda_at_rest or _torch_on_cuda() is not None,
+            "libraries": {**self._runtimes.versions(), **own.get("libraries", {})},
+            "threads": self._runtimes.threads(),
+            "synchronised": self._synchronised(),
+            "models": self._runtimes.models() or None,
             **_cuda(),
         }
+        description = {key: value for key, value in description.items() if value is not None}
         plain: dict[str, Any] = json.loads(json.dumps(description, default=_text))
         return plain
 
     def close(self) -> None:
         """Have the tracker give its resources back."""
-        getattr(self._tracker, "close", int)()
+        try:
+            getattr(self._tracker, "close", int)()
+        finally:
+            self._runtimes.close()
+
+    def _synchronised(self) -> bool | None:
+        """Whether a device was waited for; None where answers come when it has finished."""
+        if self._sync is not _cuda_at_rest or _torch_on_cuda() is not None:
+            return True
+        return False if self._runtimes.asynchronous() else None
 
     def _timed(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, dict[str, Any]]:
         """What a call returns, and the times of the answer."""
@@ -115,13 +128,6 @@ class Stopwatch:
             self._sync()
             elapsed_ns, cpu_ns = perf_counter_ns() - start, process_time_ns() - cpu
         return output, {"elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns, "stages": marked.ns}
-
-    def _limit_threads(self) -> None:
-        cv2, torch = sys.modules.get("cv2"), sys.modules.get("torch")
-        if self._threads and cv2 and cv2.getNumThreads() != self._threads:
-            cv2.setNumThreads(self._threads)
-        if self._threads and torch and torch.get_num_threads() != self._threads:
-            torch.set_num_threads(self._threads)
 
 
 def _torch_on_cuda() -> Any:
@@ -169,22 +175,6 @@ def _score(score: Any) -> float | None:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _versions() -> dict[str, str]:
-    versions = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
-    versions["opencv"] = versions.pop("cv2")
-    return {name: str(version) for name, version in versions.items() if version is not None}
-
-
-def _threads() -> dict[str, Any]:
-    threads: dict[str, Any] = {n: os.environ[n] for n in THREAD_VARIABLES if n in os.environ}
-    cv2, torch = sys.modules.get("cv2"), sys.modules.get("torch")
-    if cv2:
-        threads["opencv"] = cv2.getNumThreads()
-    if torch:
-        threads["torch"] = torch.get_num_threads()
-    return threads
 
 
 def _cuda() -> dict[str, Any]:

@@ -595,7 +595,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     tmp_path, monkeypatch, capsys
 ):
     calls = Counter()
-    for function in (lanes.simulate_lanes, pairing.pair, base.forecast):
+    for function in (lanes.simulate_many, pairing.pair, base.forecast):
         name = function.__name__
 
         def counted(*arguments, _function=function, _name=name, **named):
@@ -610,7 +610,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     assert replay_command.main(asked) == 0
     plain, alone = capsys.readouterr().out, calls.copy()
     # one group of sequences: one schedule, a pairing for each cost, and each forecaster once
-    assert alone == {"simulate_lanes": 1, "pair": 2, "forecast": 2}
+    assert alone == {"simulate_many": 1, "pair": 2, "forecast": 2}
     calls.clear()
     files = {
         "--plot": "plot.svg",
@@ -629,7 +629,7 @@ def test_whatever_files_are_asked_for_nothing_is_replayed_paired_or_forecast_twi
     calls.clear()
     timeline = ["--timeline", str(tmp_path / "timeline.svg"), "--search", "off"]
     assert replay_command.main([str(SLOW), *timeline]) == 0
-    assert calls == {"simulate_lanes": 1, "pair": 1, "forecast": 2}
+    assert calls == {"simulate_many": 1, "pair": 1, "forecast": 2}
 
 
 def test_a_fast_tracker_is_told_of_the_floor_of_one_frame():

@@ -141,7 +141,7 @@ def test_everything_that_a_profile_says_is_shown(
         "libraries opencv 5.0.0",
         "device NVIDIA Jetson Orin Nano, memory 8.0 GiB, power mode 15W (nvpmodel 0)",
         "cpu Cortex-A78AE, cores 6",
-        "timing measured, clock perf_counter_ns, cpu share 1.87, synchronised, threads 2, warmup",
+        "timing measured, clock perf_counter_ns, used 1.9 cores, synchronised, threads 2, warmup",
         "schedule every-frame, stride 2",
         "dataset DTB70",
         "lae sim commit abababababab..., modified, version 0.2.0",
@@ -244,6 +244,21 @@ def test_what_the_profiler_writes_fits_the_schema() -> None:
     wrong = {**document, "failures": [{"sequence": "s20"}]}
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(wrong, schema)
+
+
+def test_threads_beyond_what_was_asked_are_warned_of(
+    run: Callable[..., str], tmp_path: Path
+) -> None:
+    metadata, recordings = profiled()
+    path = tmp_path / "threads.parquet"
+    warning = "--threads 1 was not obeyed by all libraries: 1.9 cores were busy"
+    for asked, warned in ((1, True), (2, False)):
+        threads = {"asked": asked, "opencv": 1, "ncnn": "unknown"}
+        timing = {**metadata.document["timing"], "threads": threads}
+        write_trace(Trace(Metadata.of({**metadata.document, "timing": timing}), recordings), path)
+        text = " ".join(run(path).split())
+        assert (warning in text) is warned
+        assert f"threads asked {asked}, ncnn unknown, opencv 1" in text
 
 
 def test_pictures(run: Callable[..., str], full: Path, tmp_path: Path) -> None:

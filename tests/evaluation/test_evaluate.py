@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
 
@@ -35,6 +36,7 @@ from lae_sim.evaluation.evaluate import (
     answers,
     evaluate_groups,
     evaluate_runs,
+    evaluate_together,
 )
 from lae_sim.evaluation.metrics import (
     CONVENTIONS,
@@ -48,7 +50,7 @@ from lae_sim.evaluation.pairing import pair
 from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman, KalmanLaePvt
 from lae_sim.replay.latency import LatencySource, by_frame, constant, initialised
-from lae_sim.replay.run import Run, replay_sequence
+from lae_sim.replay.run import Run, RunBatch, replay_sequence
 from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.trace.metadata import ImageSizes, Metadata
@@ -387,6 +389,44 @@ def test_observers_see_what_is_scored(frames: int, monkeypatch: pytest.MonkeyPat
                     assert getattr(chosen, field).tolist() == getattr(alone, field).tolist()
                 for field in ("mismatch_sum", "mismatch_max", "longest_hold"):
                     assert getattr(chosen, field).tolist() == getattr(alone, field).tolist()
+
+
+@pytest.mark.parametrize("frames", [1, 200, 800, 10**6])
+def test_replays_that_are_scored_together_have_the_scores_that_they_have_alone(frames: int) -> None:
+    def replayed(seed: int, fps: Fraction, reach: float) -> list[Run]:
+        search = SearchModel(np.array([reach]), True, "given")
+        return [
+            replay_sequence(moving(20 + 9 * s, seed + s, f"s{s}"), Clock.at(fps), search=search)
+            for s in range(4)
+        ]
+
+    rates = [Fraction(30), Fraction(30), Fraction(25), Fraction(30)]
+    replays = [replayed(10 * k, fps, 0.3 + k) for k, fps in enumerate(rates)]
+    of = [Metadata.new("30", "every-frame", dataset={"name": str(k)}) for k in range(4)]
+    sigmas = [Fraction(0), Fraction(3, 4)]
+    more = {"costs": COSTS, "frames": frames}
+    runs = (
+        (k, RunBatch.of(some[a:b])) for k, some in enumerate(replays) for a, b in ((0, 1), (1, 4))
+    )
+    together = evaluate_together(runs, of, FORECASTERS, sigmas, **more)  # type: ignore[arg-type]
+    alone = [
+        (k, part)
+        for k, some in enumerate(replays)
+        for part in evaluate_groups(some, of[k], FORECASTERS, sigmas, **more)  # type: ignore[arg-type]
+    ]
+    assert [(k, _contents(part)) for k, part in together] == [(k, _contents(p)) for k, p in alone]
+    assert len(alone) == {1: 16, 200: 8}.get(frames, 4)
+
+
+def _contents(record: object) -> object:
+    """All that is in records of records, arrays to the byte."""
+    if isinstance(record, np.ndarray):
+        return record.dtype, record.shape, record.tobytes()
+    if isinstance(record, Mapping):
+        return {name: _contents(value) for name, value in record.items()}
+    if is_dataclass(record):
+        return [_contents(getattr(record, field.name)) for field in fields(record)]
+    return record
 
 
 def test_curves_are_at_the_sigma_that_is_asked_for() -> None:

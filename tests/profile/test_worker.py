@@ -542,7 +542,7 @@ def test_describe_says_what_runs(start: Any, make: Callable[..., TimedTracker]) 
     assert found["size"] == 3
     assert json.dumps(found)
     with in_process() as tracker:
-        assert tracker.describe()["synchronised"] is False
+        assert "synchronised" not in tracker.describe()  # nothing had to be waited for
 
 
 USES = """
@@ -574,7 +574,7 @@ def test_threads_are_limited(
         worker.init(FRAME, BOX)
         found = worker.describe()
     assert found["threads"][name] == threads
-    assert found["threads"]["OMP_NUM_THREADS"] == str(threads)
+    assert found["threads"]["asked"] == threads
     assert found["libraries"][name]
 
 
@@ -603,5 +603,5 @@ def test_torch_on_cuda_is_waited_for_and_named(monkeypatch: pytest.MonkeyPatch) 
         found = tracker.describe()
         assert "gpu" not in found
         assert found["cuda"]
-        assert found["synchronised"] is False
+        assert "synchronised" not in found
         assert tracker.track(FRAME).elapsed_ns < 20e6

@@ -26,7 +26,15 @@ from lae_sim.replay.latency import (
     resampled,
     scaled,
 )
-from lae_sim.replay.run import Repetitions, Run, Runs, grouped, replay_repeated, replay_sequence
+from lae_sim.replay.run import (
+    Repetitions,
+    Run,
+    Runs,
+    grouped,
+    replay_repeated,
+    replay_sequence,
+    replay_together,
+)
 from lae_sim.replay.world import replay_trace
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
@@ -77,6 +85,21 @@ def test_a_batch_gives_the_same_runs(source: LatencySource, policy: Policy) -> N
     for options in ({}, {"timing": SLOWER}, {"passes": [half]}, {"fps": Fraction(30000, 1001)}):
         runs = replay_trace(TRACE, latency=source, policy=policy, **options)  # type: ignore[arg-type]
         assert [fields(r) for r in runs] == [fields(r) for r in in_simpy(runs)]
+
+
+@pytest.mark.usefixtures("groups")
+def test_replays_together_are_what_they_are_alone() -> None:
+    replays = [
+        replay_trace(TRACE),
+        replay_trace(SLOWER, latency=constant(ns=47_000_000)),
+        replay_trace(TRACE, fps=Fraction(25)),
+        replay_trace(TRACE, policy=every(2)),
+        replay_trace(TRACE, latency=lambda recording: by_frame(recording).__call__),
+    ]
+    alone = [(k, fields(run)) for k, runs in enumerate(replays) for run in in_simpy(runs)]
+    for frames in (1, 200, 10**6):
+        together = replay_together(replays, frames)
+        assert [(k, fields(run)) for k, batch in together for run in batch] == alone
 
 
 def in_simpy(runs: Runs) -> Iterator[Run]:

@@ -4,6 +4,7 @@ import hashlib
 from time import perf_counter_ns
 
 import numpy as np
+import onnx_models
 import pytest
 from moving import centre_error, cv2, moving, straight
 
@@ -153,6 +154,64 @@ def test_weights_that_are_no_networks_are_named(tmp_path, shared_data):
     swapped = {"backbone": files["head"], "head": files["backbone"]}
     with pytest.raises(LaeError, match="are not a backbone and a head"):
         make_tracker("nanotrack", swapped)
+
+
+@pytest.fixture
+def made(tmp_path):
+    """Weights that are none of NanoTrack's, with its inputs and outputs."""
+    return str(onnx_models.write_nanotrack(tmp_path))
+
+
+@pytest.fixture
+def ort():
+    return pytest.importorskip("onnxruntime")
+
+
+def test_onnx_runtime_answers_as_opencv(ort, made):
+    truth = straight(6)
+    frames = list(moving(truth))
+    trackers = [
+        make_tracker("nanotrack", {"weights": made, "runtime": runtime})
+        for runtime in ("opencv", "onnxruntime")
+    ]
+    opencv, onnx = (boxes_of(tracker, frames, truth[0]) for tracker in trackers)
+    np.testing.assert_allclose(onnx, opencv, atol=0.01)
+    first, second = (tracker.describe() for tracker in trackers)
+    assert first["weights_digest"] == second["weights_digest"]
+    assert second["settings"]["runtime"] == "onnxruntime"
+    assert second["settings"]["provider"] == "CPU"
+
+
+def test_onnx_runtime_answers_as_opencv_with_real_weights(ort, shared_data, weights):
+    frames, truth = real(shared_data, "DTB70/MountainBike6", 20)
+    opencv, onnx = (
+        boxes_of(
+            make_tracker("nanotrack", {"weights": str(weights), "runtime": runtime}),
+            frames,
+            truth[0],
+        )
+        for runtime in ("opencv", "onnxruntime")
+    )
+    np.testing.assert_allclose(onnx, opencv, atol=0.5)
+
+
+def test_runtimes_and_providers_that_are_none(ort, made):
+    def refused(message, **options):
+        with pytest.raises(LaeError, match=message):
+            make_tracker("nanotrack", {"weights": made, **options})
+
+    refused("no runtime 'tflite': there are opencv, onnxruntime", runtime="tflite")
+    refused("add runtime=onnxruntime", provider="CUDA")
+    refused("no provider 'Abacus'", runtime="onnxruntime", provider="Abacus")
+    refused("'tpu' is neither", runtime="onnxruntime", device="tpu")
+    if "CUDAExecutionProvider" not in ort.get_available_providers():
+        refused("no provider 'CUDA'", runtime="onnxruntime", device="cuda:1")
+    swapped = {"backbone": f"{made}/head.onnx", "head": f"{made}/backbone.onnx"}
+    with pytest.raises(LaeError, match=r"head\.onnx: ONNX Runtime .* it has no input 'input'"):
+        make_tracker("nanotrack", {**swapped, "runtime": "onnxruntime"})
+    twice = {**swapped, "backbone": f"{made}/backbone.onnx"}
+    with pytest.raises(LaeError, match="are not a backbone and a head of NanoTrack"):
+        make_tracker("nanotrack", {**twice, "runtime": "onnxruntime"})
 
 
 def test_devices(weights):

@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from lae_sim.comparison import pairs
+from lae_sim.comparison.pairs import Member, pairs_of, superiority
 from lae_sim.comparison.statistics import Bootstrap, holm
-from lae_sim.study import pairs
-from lae_sim.study.pairs import Member, pairs_of, superiority
 
 RNG = np.random.default_rng(7)
 RESAMPLES = 500
