@@ -200,8 +200,7 @@ class Evaluated:
             document["pipeline"] = self.pipeline.report()
             delays = {float(s): self.pipeline.answer_delay_ms(s) for s in world.sigmas}
             for result in document["results"]:  # LAE's age knows no camera
-                result["capture_age_ms"] = result["age_ms"]
-                result["age_ms"] -= delays[result["sigma"]]
+                result["capture_age_ms"] = result["age_ms"] + delays[result["sigma"]]
         return document
 
 

@@ -87,8 +87,8 @@ class PipelineSchedule(Schedule):
 
     Attributes:
         pipeline: what was run.
-        delivered: when each frame reached the first stages, int64 [T], ticks; -1 where the camera
-            lost it. They are captured at ``clock.arrival(frame)``.
+        delivered: see :class:`.scheduler.Schedule`; -1 for frames that the camera lost. They are
+            captured at ``clock.arrival(frame)``.
         stages: by name, in the pipeline's order.
     """
 

@@ -313,8 +313,9 @@ def _draw_stages(
 
     ticks_per_ms = schedule.clock.ticks_per_ns * 1e6
     end = schedule.clock.end(schedule.length)
-    output = schedule.pipeline.output  # the lowest row, which answers the queries below it
-    stages = sorted(schedule.pipeline.stages[::-1], key=lambda stage: stage.name != output)
+    pipeline = schedule.pipeline
+    stages = [stage for stage in pipeline.stages if stage.name != pipeline.output][::-1]
+    stages.insert(0, pipeline.way[-1])  # the lowest row, which answers the queries below it
     for row, stage in enumerate(stages, 1):
         log, height = schedule.stages[stage.name], 0.62 / stage.workers
         held = np.where(log.left >= 0, log.left, np.where(log.gone >= 0, log.gone, 2 * end))

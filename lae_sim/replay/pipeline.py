@@ -26,7 +26,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -117,6 +117,44 @@ def parse_pipeline(document: Mapping[str, Any], name: str = "pipeline") -> Pipel
     pipeline = Pipeline(**values)
     PipelineTimes.of(pipeline)  # whose names are looked up
     return pipeline
+
+
+def pipeline_document(pipeline: Pipeline) -> dict[str, Any]:
+    """A pipeline as plain values, which :func:`parse_pipeline` makes the same pipeline of.
+
+    Raises:
+        LaeError: if a time is a function, which has no name; it says where.
+    """
+    camera = asdict(pipeline.camera)
+    if not isinstance(camera["drops"], str):
+        camera["drops"] = list(camera["drops"])
+    if camera["jitter"] is None:
+        del camera["jitter"]
+    return {
+        "name": pipeline.name,
+        "tracker": pipeline.tracker,
+        "camera": {key: _plain("camera", key, value) for key, value in camera.items()},
+        "resources": dict(pipeline.resources),
+        "stages": [_plain_stage(stage) for stage in pipeline.stages],
+    }
+
+
+def _plain_stage(stage: Stage) -> dict[str, Any]:
+    values = {**asdict(stage), "queue": "unbounded" if stage.queue is None else stage.queue}
+    where = f"stage {stage.name!r}"
+    return {key: _plain(where, key, value) for key, value in values.items() if value is not None}
+
+
+def _plain(where: str, key: str, value: Any) -> Any:
+    if callable(value):
+        raise LaeError(f"{where}: {key}: a function: name it, as 'package.module:object'")
+    return value
+
+
+def times_named(pipeline: Pipeline) -> list[str]:
+    """The names of all times in a pipeline."""
+    times = [pipeline.camera.jitter, *(stage.time for stage in pipeline.stages)]
+    return [time for time in times if isinstance(time, str)]
 
 
 def _checked(what: str, document: Any, kind: type) -> Mapping[str, Any]:
