@@ -650,10 +650,11 @@ def _waterfalls(parts: Sequence[Evaluated]) -> tuple[list[dict[str, Any]], list[
             settings.append({**_setting(part.scenario), "policy": part.pipeline.pipeline.name})
     if not reports:
         raise LaeError("nothing to draw a waterfall of: no pipeline has answered a frame")
+    several = len({setting["policy"] for setting in settings})
     telling = [
         name
         for name in ("trace", "latency", "fps", "scale")
-        if len({setting[name] for setting in settings}) > 1
+        if len({(setting["policy"], setting[name]) for setting in settings}) > several
     ]
     names = [
         ", ".join([
