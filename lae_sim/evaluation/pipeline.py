@@ -76,6 +76,11 @@ class _Spans:
             self.most = max(self.most, float(spans.max()))
 
     @property
+    def mean_ns(self) -> float:
+        """Their mean, ns; 0 of none."""
+        return self.total / self.count if self.count else 0.0
+
+    @property
     def mean_ms(self) -> float | None:
         """Their mean, ms; None of none."""
         return self.total / self.count / 1e6 if self.count else None
@@ -164,7 +169,7 @@ class StageTotals:
     @property
     def asked(self) -> float:
         """Work on all frames that it was to work on, as if none were an initialisation, ns."""
-        return self.steady.total / self.steady.count * self.due if self.steady.count else 0.0
+        return self.steady.mean_ns * self.due
 
     def add(self, log: StageLog, captured: Ints, end: int, ticks_per_ns: int) -> None:
         """Take in a sequence."""
@@ -375,11 +380,24 @@ class PipelineTotals:
     def _sharing(self, resource: str) -> list[StageTotals]:
         return [each for each in self.stages if each.stage.resource == resource]
 
+    def _lost_before(self, totals: StageTotals, resource: str) -> float:
+        """Frames that a stage was to work on, lost where the same resource is needed before it."""
+        by_name = {each.stage.name: each for each in self.stages}
+        lost, before = 0, by_name.get(totals.stage.after or CAMERA)
+        while before is not None:
+            lost += before.lost if before.stage.resource == resource else 0
+            before = by_name.get(before.stage.after or CAMERA)
+        return lost / totals.stage.every
+
     def _load(self, totals: StageTotals) -> float:
         return self._share(totals.asked, totals.stage.workers)
 
     def _resource_load(self, resource: str) -> float:
-        asked = sum(each.asked for each in self._sharing(resource))
+        """What is asked of a resource, too of frames that were lost as it was not there in time."""
+        asked = sum(
+            each.asked + each.steady.mean_ns * self._lost_before(each, resource)
+            for each in self._sharing(resource)
+        )
         return self._share(asked, self.pipeline.resources[resource])
 
     def _share(self, busy: float, workers: int) -> float:

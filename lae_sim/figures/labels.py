@@ -28,5 +28,7 @@ def bottleneck_text(pipeline: dict[str, Any]) -> str:
     """The first stage of a pipeline that is too slow, in a sentence; or that none is."""
     if pipeline["bottleneck"] is not None:
         return str(pipeline["bottleneck"]["text"])
-    busiest = max(pipeline["stages"], key=itemgetter("load"))
-    return f"every stage keeps up; the busiest, {busiest['stage']}, with {busiest['load']:.0%}"
+    loads = [(each["load"], each["stage"]) for each in pipeline["stages"]]
+    loads += [(each["load"], each["resource"]) for each in pipeline["resources"]]
+    load, busiest = max(loads, key=itemgetter(0))
+    return f"every stage keeps up; {busiest}, the busiest, with {load:.0%} of what it can do"

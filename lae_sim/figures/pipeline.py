@@ -49,11 +49,13 @@ def waterfall_figure(reports: Sequence[Report], labels: Sequence[str]) -> Figure
     panels: list[Axes] = figure.subplots(
         len(reports), 1, sharex=True, squeeze=False, height_ratios=heights
     )[:, 0].tolist()
+    right = 0.0
     for axes, report, label in zip(panels, reports, labels):
-        draw_waterfall(axes, report)
+        right = max(right, draw_waterfall(axes, report))
         said = f"{label}: {bottleneck_text(report['pipeline'])}"
         axes.set_title(fill(said, 98), loc="left", fontsize=8.5)
         axes.label_outer()
+    panels[0].set_xlim(0, right)  # of all
     handles = {
         label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels())
     }
@@ -82,8 +84,18 @@ def waterfalls_for_paper(
         )
 
 
-def draw_waterfall(axes: Axes, report: Report, width: float = _WIDTH, size: float = 8) -> None:
-    """One pipeline's, its first row on top, in a figure of some inches; letters in points."""
+def draw_waterfall(axes: Axes, report: Report, width: float = _WIDTH, size: float = 8) -> float:
+    """One pipeline's, its first row on top.
+
+    Args:
+        axes: where to.
+        report: of a trace that was replayed through a pipeline.
+        width: of the figure, inches.
+        size: of letters, points.
+
+    Returns:
+        The right end of the axis, ms.
+    """
     pipeline, result = report["pipeline"], report["results"][0]
     rows = _rows(report)
     begin, notes = 0.0, []
@@ -106,7 +118,8 @@ def draw_waterfall(axes: Axes, report: Report, width: float = _WIDTH, size: floa
             note, (place, row), (4, 0), textcoords="offset points", va="center", fontsize=size
         )
     letter = 0.0065 * size / (0.75 * width)  # of the axes' width, about
-    axes.set_xlim(0, max(at / max(0.25, 0.97 - letter * len(note)) for _, at, note in notes) or 1)
+    right = max(at / max(0.25, 0.97 - letter * len(note)) for _, at, note in notes) or 1
+    axes.set_xlim(0, right)
     names = [*(_named(pipeline, name) for name in rows), "when queried"]
     axes.set_yticks(range(len(names)), names)
     axes.set(ylim=(len(rows) + 0.6, -0.6), xlabel="age since capture (ms)")
@@ -114,6 +127,7 @@ def draw_waterfall(axes: Axes, report: Report, width: float = _WIDTH, size: floa
     for text, name in zip(axes.get_yticklabels(), rows):
         if _is_slow(pipeline, name):
             text.set_fontweight("bold")
+    return right
 
 
 def _rows(report: Report) -> dict[str, list[dict[str, Any]]]:
