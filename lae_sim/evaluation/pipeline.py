@@ -115,8 +115,8 @@ class _Step:
         return {
             "mean_ms": self.spans[0].mean_ms,
             "p95_ms": _p95_ms(self.taken),
-            "age_ms": self.spans[1].mean_ms,
-            "age_p95_ms": _p95_ms(self.ages),
+            "capture_age_ms": self.spans[1].mean_ms,
+            "capture_age_p95_ms": _p95_ms(self.ages),
         }
 
 

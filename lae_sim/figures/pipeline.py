@@ -105,11 +105,11 @@ def draw_waterfall(axes: Axes, report: Report, width: float = _WIDTH, size: floa
             look = {"edgecolor": "black", "linewidth": 0.5, "height": 0.62, **style}
             look["facecolor"] = look.pop("color")
             axes.barh(row, step["mean_ms"], left=begin, label=label, **look)
-            begin = step["age_ms"]
+            begin = step["capture_age_ms"]
         end = steps[-1]
-        axes.plot([begin, end["age_p95_ms"]], [row, row], color="black", linewidth=0.8)
-        axes.plot(end["age_p95_ms"], row, "|", color="black", markersize=5)
-        notes.append((row, max(begin, end["age_p95_ms"]), _note(pipeline, name, begin)))
+        axes.plot([begin, end["capture_age_p95_ms"]], [row, row], color="black", linewidth=0.8)
+        axes.plot(end["capture_age_p95_ms"], row, "|", color="black", markersize=5)
+        notes.append((row, max(begin, end["capture_age_p95_ms"]), _note(pipeline, name, begin)))
     age = result["capture_age_ms"]
     axes.plot(age, len(rows), "D", color="black", markersize=4)
     notes.append((len(rows), age, f"{age:.0f} ms"))
@@ -135,7 +135,7 @@ def _rows(report: Report) -> dict[str, list[dict[str, Any]]]:
     rows: dict[str, list[dict[str, Any]]] = {}
     for step in report["pipeline"]["waterfall"]:
         rows.setdefault(step["stage"], []).append(step)
-    if not rows[CAMERA][-1]["age_p95_ms"]:
+    if not rows[CAMERA][-1]["capture_age_p95_ms"]:
         del rows[CAMERA]
     return {
         name: [step for step in steps if step["p95_ms"] or step["part"] == "work"] or steps[-1:]

@@ -100,10 +100,10 @@ def test_the_waterfall_adds_up_to_the_age_of_the_answers() -> None:
         ("publish", "queue"): 0,
         ("publish", "work"): 5,
     }
-    assert steps[-1]["age_ms"] == pytest.approx(sum(means.values()))
-    assert steps[-1]["age_ms"] == pytest.approx((105 + 85 + 105) / 3)
+    assert steps[-1]["capture_age_ms"] == pytest.approx(sum(means.values()))
+    assert steps[-1]["capture_age_ms"] == pytest.approx((105 + 85 + 105) / 3)
     waits = next(step for step in steps if step["stage"] == "tracker")
-    assert (waits["p95_ms"], waits["age_p95_ms"]) == (pytest.approx(20), pytest.approx(40))
+    assert (waits["p95_ms"], waits["capture_age_p95_ms"]) == (pytest.approx(20), pytest.approx(40))
 
 
 def test_what_blocks_and_what_is_shared_has_its_place_in_the_waterfall() -> None:
@@ -118,7 +118,7 @@ def test_what_blocks_and_what_is_shared_has_its_place_in_the_waterfall() -> None
         ("publish", "queue"), ("publish", "work"),
     ]  # fmt: skip
     assert steps[5]["mean_ms"] > 0
-    assert steps[-1]["age_ms"] == pytest.approx(sum(step["mean_ms"] for step in steps))
+    assert steps[-1]["capture_age_ms"] == pytest.approx(sum(step["mean_ms"] for step in steps))
 
 
 def slow(*stages: Stage, length: int = 100, **others: Any) -> tuple[str, str, float] | None:

@@ -46,7 +46,7 @@ def test_each_part_begins_where_the_one_before_it_ends() -> None:
     bars = [bar for bar in axes.patches if bar.get_width() > 0]
     assert [bar.get_width() for bar in bars] == pytest.approx([step["mean_ms"] for step in steps])
     ends = [bar.get_x() + bar.get_width() for bar in bars]
-    assert ends == pytest.approx([step["age_ms"] for step in steps])
+    assert ends == pytest.approx([step["capture_age_ms"] for step in steps])
     assert [bar.get_x() for bar in bars] == pytest.approx([0, *ends[:-1]])
     (diamond,) = (line for line in axes.lines if line.get_marker() == "D")
     assert list(diamond.get_xdata()) == [document["results"][0]["capture_age_ms"]]
