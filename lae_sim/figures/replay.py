@@ -344,8 +344,9 @@ def _draw_stages(
                     )  # fmt: skip
             if (width := min(finished, right) - max(started, left)) > 0.02 * (right - left):
                 middle = max(started, left) + width / 2
-                letter = {"ha": "center", "va": "center", "fontsize": size}
-                axes.text(middle, place, str(frame), color="w", **letter)
+                axes.text(
+                    middle, place, str(frame), ha="center", va="center", color="w", fontsize=size
+                )
         lost = log.gone[log.dropped == Drop.FULL] / ticks_per_ms
         lost = lost[(lost >= left) & (lost <= right)]
         axes.plot(lost, np.full(len(lost), row + 0.4), "x", color=VERMILION, markersize=4)

@@ -1,5 +1,5 @@
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from fractions import Fraction
 from itertools import pairwise
 
@@ -328,6 +328,28 @@ def test_perfetto_loads_every_slice_and_flow(written):
     assert len(flows) == sum(e["ph"] == "f" for e in events) > 800
     for row in flows:
         assert row["output"].removeprefix("frame ") == row["answer"].split()[0]
+
+
+def test_perfetto_loads_the_tracks_of_a_pipeline(tmp_path):
+    path = tmp_path / "out.json"
+    options = ("--sequence", "boat-calm", "--latency", "constant:47ms")
+    replay(SLOW, *options, "--pipeline", SLOW.with_name("pipeline.toml"), "--timeline", path)
+    events = json.loads(path.read_text())["traceEvents"]
+    slices, counts, errors = queried(
+        path,
+        "SELECT t.name AS thread, count(*) AS n FROM slice s JOIN thread_track k "
+        "ON s.track_id = k.id JOIN thread t USING (utid) GROUP BY t.name",
+        "SELECT k.name AS name, count(*) AS n FROM counter c JOIN process_counter_track k "
+        "ON c.track_id = k.id GROUP BY k.name",
+        "SELECT name FROM stats WHERE value > 0 AND severity <> 'info'",
+    )
+    assert errors == []
+    expected = Counter(e["name"] for e in events if e["ph"] == "C")
+    assert {row["name"].removesuffix(" frames"): row["n"] for row in counts} == expected
+    names = {e["tid"]: e["args"]["name"] for e in events if e["name"] == "thread_name"}
+    shown = Counter(names[e["tid"]] for e in events if e["ph"] in "Xi")
+    assert {row["thread"]: row["n"] for row in slices} == shown
+    assert {"decode", "tracker", "tracker: dropped", "publish", "delivery"} < shown.keys()
 
 
 def test_a_picture_of_the_first_sequence(tmp_path):
