@@ -35,6 +35,7 @@ examples:
   lae-sim profile --dataset DTB70 --root ~/data/DTB70 --stride 3/2 2 3
   lae-sim profile --tracker nanotrack --option weights=nanotrackv3 --root ~/data/DTB70
   lae-sim profile --tracker my_package.my_module:MyTracker --option size=small --device cuda:0
+  lae-sim profile --tracker vot:NCC --ini workspace/trackers.ini --root ~/data/DTB70
   lae-sim profile --mode real-time --pre-forecaster kalman --timing jetson.parquet
   lae-sim profile --closed-loop constant:47ms constant:100ms --stride 3/2 2 3  then lae-sim fidelity
   lae-sim profile --gaps 10m --stride 2                how far it finds a target from where it was
@@ -48,6 +49,7 @@ trackers:
   pysot                   SiamRPN++, SiamMask: --option checkout= config= snapshot=
   pytracking              ATOM, DiMP, PrDiMP: --option checkout= tracker= parameter= network=
   trax:COMMAND            any program that speaks TraX
+  vot:NAME                what the VOT toolkit's trackers.ini names (--ini PATH)
   package.module:factory  your own: an object with init(frame, box) and track(frame)
 """
 
@@ -72,6 +74,7 @@ def parser() -> argparse.ArgumentParser:
         help="options of the tracker",
     )
     add("--device", help="the option device: cpu, cuda:0")
+    add("--ini", metavar="PATH", help="registry of vot:NAME (default: trackers.ini)")
     add("--trust-checkpoint", action="store_true", help="let pytracking unpickle its checkpoint")
     add("--translate", action="store_true", help="set the search by shifting the frame")
     add("--python", metavar="PATH", help="interpreter of the worker process (3.8 or newer)")
@@ -85,9 +88,8 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--frame-timeout",
         type=argument(parse_duration),
-        default=30_000_000_000,
         metavar="TIME",
-        help="give a sequence up when a call takes longer (default: 30s)",
+        help="give a sequence up when a call takes longer (default: 30s or the registry's)",
     )
     add(
         "--warmup",
@@ -196,6 +198,8 @@ def _profile(arguments: argparse.Namespace, failed: list[Any]) -> None:
     options = parse_options(dict(arguments.option))
     if arguments.device is not None:
         options["device"] = arguments.device
+    if arguments.ini is not None:
+        options["ini"] = arguments.ini
     if arguments.trust_checkpoint:
         options["trust_checkpoint"] = True
     plan = ProfilePlan(

@@ -82,7 +82,8 @@ class ProfilePlan:
         python: interpreter of the worker process, 3.8 or newer; this one if None.
         in_process: run the tracker in this process, without timeouts: for debugging.
         threads: that the tracker's libraries may use; None leaves them as they are.
-        frame_timeout: what a call may take before its sequence is given up, ns.
+        frame_timeout: what a call may take before its sequence is given up, ns; None is 30 s, or
+            what the registry of a ``vot:`` tracker says.
         warmup: calls before anything is measured.
         dataset, root, sequences, box, fps, frame_times: the frames (see
             :func:`lae_sim.datasets.layouts.find_dataset`).
@@ -113,7 +114,7 @@ class ProfilePlan:
     python: str | None = None
     in_process: bool = False
     threads: int | None = None
-    frame_timeout: int = 30 * NS_PER_SECOND
+    frame_timeout: int | None = None
     warmup: int = 5
     dataset: str | None = None
     root: str | Path | None = None
@@ -494,7 +495,7 @@ def _start(plan: ProfilePlan, notice: Callable[[str], object]) -> TimedTracker:
             plan.options,
             python=plan.python,
             threads=plan.threads,
-            timeout=plan.frame_timeout / NS_PER_SECOND,
+            timeout=plan.frame_timeout and plan.frame_timeout / NS_PER_SECOND,
         )
     needed = plan.pre_forecaster is not None and not tracker.sets_search
     if needed:
