@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,7 +31,7 @@ from lae_sim.replay.names import (
 )
 from lae_sim.replay.pipeline import parse_pipeline, pipeline_document, read_pipeline
 from lae_sim.replay.search import parse_search
-from lae_sim.replay.world import check_sigmas, parse_sigmas
+from lae_sim.replay.world import World, check_sigmas, parse_sigmas
 from lae_sim.trace.file import Trace
 
 RANDOM = ("bootstrap", "resample", "lognormal")
@@ -124,6 +125,11 @@ class Study:
         for policy in self.policies:
             if not scores_latency(parse_policy(policy)):
                 raise LaeError(f"policies: {policy} never scores latency: it goes with replay")
+        for pipeline, latency in product(self.pipelines, self.times):
+            try:
+                World(latency=self.seeded(latency), pipeline=pipeline)
+            except LaeError as error:
+                raise LaeError(f"pipelines: {pipeline.name}: {error}") from error
         for cost in self.costs:
             if cost.rpartition("=")[2] == "measured":
                 raise LaeError("costs: declare a time: one measured would differ on every worker")

@@ -87,6 +87,17 @@ def test_pipelines_that_are_none_are_refused(pipelines: Any, words: str) -> None
     assert words in str(caught.value)
 
 
+def test_the_tracker_s_time_is_the_latency_or_the_pipeline_s_own() -> None:
+    own = {"own": {"stages": [{"name": "tracker", "time": "30ms"}]}}
+    assert Study.of({"traces": "a", "pipelines": own, "latencies": "recorded"}).pipelines
+    with pytest.raises(LaeError) as caught:
+        Study.of({"traces": "a", "pipelines": own, "latencies": ["recorded", "bootstrap"]})
+    assert str(caught.value) == (
+        "pipelines: own: latency: bootstrap:0:30, and the pipeline says constant:30ms: leave out "
+        "the time of its stage 'tracker'"
+    )
+
+
 def test_a_study_has_a_policy_or_a_pipeline() -> None:
     with pytest.raises(LaeError, match="policies: the list is empty, and there are no pipelines"):
         Study.of({"traces": "a.parquet", "policies": []})
