@@ -246,11 +246,13 @@ def timeline_for_paper(run: Run, sigma: Fraction = Fraction(0)) -> ColumnFigure:
     shown = range(first, min(first + min(max(few, 8), 16), schedule.length))
     draw = partial(_draw_timeline, run=run, sigma=sigma, shown=shown, size=6)
     rows = len(getattr(schedule, "stages", " "))  # of a pipeline; else there is one, the tracker's
-    name = run.recording.name
+    name, works = run.recording.name, "the tracker at work on them"
+    if schedule.visible is not None:
+        works = "the stages at work (hollow: a frame is held up; crosses: frames are dropped)"
     return ColumnFigure(
         f"timeline-{name}",
-        f"{name}: frames as they arrive (hollow: skipped), the tracker at work on them, and the "
-        "frame whose output answers the query for each",
+        f"{name}: frames as they arrive (hollow: skipped), {works}, and the frame whose output "
+        "answers the query for each",
         partial(column_figure, draw, 1.2 + 0.3 * rows),
     )
 

@@ -12,6 +12,7 @@ import lae_sim
 from lae_sim.api.evaluation import plot_waterfalls
 from lae_sim.errors import LaeError
 from lae_sim.figures.pipeline import draw_waterfall, waterfalls_for_paper
+from lae_sim.figures.replay import timeline_figure, timeline_for_paper
 from lae_sim.figures.style import new_figure
 from lae_sim.trace.file import Trace
 
@@ -103,6 +104,26 @@ def test_a_paper_has_a_figure_for_each() -> None:
     assert "core is too slow" in figures[0].caption
     for figure in figures:
         assert figure.draw().get_figwidth() == 3.4
+
+
+def test_a_timeline_has_a_row_for_each_stage() -> None:
+    trace = Trace(lae_sim.Metadata.new("25", "every-frame"), [moving(9)])
+    side = lae_sim.Stage("log", "90ms", after="camera", workers=2)
+    pipeline = lae_sim.Pipeline([*DRONE.stages, side], DRONE.camera, DRONE.resources)
+    (run,) = lae_sim.replay_trace(trace, pipeline=pipeline)
+    (axes,) = timeline_figure(run).axes
+    labels = [text.get_text() for text in axes.get_yticklabels()]
+    assert labels[:-1] == ["query and source", "publish", "log", "tracker", "decode"]
+    log = run.schedule.stages["tracker"]  # no call waits for its core: it is the most urgent
+    bars = [bar for bar in axes.patches if 2.5 < bar.get_y() + bar.get_height() / 2 < 3.5]
+    shown = [bar for bar in bars if bar.get_facecolor() != (1, 1, 1, 1)]
+    ticks_per_ms = run.schedule.clock.ticks_per_ns * 1e6
+    began = log.started[log.started >= 0] / ticks_per_ms
+    assert sorted(bar.get_x() for bar in shown) == pytest.approx(began.tolist())
+    places = {round(bar.get_y(), 2) for bar in axes.patches if 1.5 < bar.get_y() + 0.3 < 2.5}
+    assert len(places) == 2  # of the two workers that log
+    caption = timeline_for_paper(run).caption
+    assert "the stages at work (hollow: a frame is held up" in caption
 
 
 def test_without_a_pipeline_there_is_nothing_to_draw() -> None:
