@@ -39,6 +39,7 @@ examples:
   lae-sim profile --mode real-time --pre-forecaster kalman --timing jetson.parquet
   lae-sim profile --closed-loop constant:47ms constant:100ms --stride 3/2 2 3  then lae-sim fidelity
   lae-sim profile --gaps 10m --stride 2                how far it finds a target from where it was
+  lae-sim profile --root ~/data/DTB70 --beside './encode.sh'    beside the load that it will have
   lae-sim profile --closed-loop constant:47ms,init=1s --stride 3/2 2 3         then lae-sim fidelity
 
 trackers:
@@ -170,6 +171,23 @@ def parser() -> argparse.ArgumentParser:
         help="repeat the first pass (default: 1)",
     )
     add("--include-decode", action="store_true", help="count the decoding of frames")
+    add(
+        "--beside",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="COMMAND",
+        help="run these shell commands as long as anything is measured, such as the video encoder "
+        "that shares the device; they are ended then",
+    )
+    add(
+        "--idle",
+        type=argument(parse_duration),
+        default=2_000_000_000,
+        metavar="TIME",
+        help="measure the power at rest so long before the tracker starts, where there are sensors "
+        "(default: 2s)",
+    )
     group = made.add_argument_group("output")
     add = group.add_argument
     add("--out", metavar="TRACE", help="the trace (default: TRACKER-DATASET.parquet)")
@@ -228,6 +246,8 @@ def _profile(arguments: argparse.Namespace, failed: list[Any]) -> None:
         gaps=BUDGET_NS if arguments.gaps is True else arguments.gaps,
         repeat=arguments.repeat,
         include_decode=arguments.include_decode,
+        beside=tuple(arguments.beside),
+        idle=arguments.idle,
     )
     with closing(ProgressBar(arguments.tracker, "frames")) as bar:
 
