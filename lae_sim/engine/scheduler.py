@@ -63,6 +63,8 @@ class Schedule:
         visible: from when each output answers queries, int64 [n], ticks, never decreasing;
             ``NEVER`` for one that never does. None: from when it is ready. Stages after a tracker
             make it later (see :class:`.stages.PipelineSchedule`).
+        delivered: when each world frame reached the first stage, int64 [T], ticks; -1 where none
+            did. None: as it was captured.
     """
 
     clock: Clock
@@ -72,6 +74,7 @@ class Schedule:
     ready: Ints
     scores_latency: bool = True
     visible: Ints | None = None
+    delivered: Ints | None = None
 
     def __repr__(self) -> str:
         processed = f"{len(self.frames):,} of {self.length:,} frames processed"

@@ -14,6 +14,7 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import search_distance
+from lae_sim.engine.scheduler import Schedules
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention, is_scored
 from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_scores
@@ -112,7 +113,8 @@ class Staleness:
         mismatch_sum, mismatch_max: over the world frames, frames, int64 [S, M].
         longest_hold: most queries in a row with one answering output, frames, int64 [S, M].
         age_sum, age_max, longest_stale: the same in time, by when frames arrive, in nominal frame
-            intervals, float64 [S, M]; the permitted latency is not in it.
+            intervals, float64 [S, M]; the permitted latency is not in it, nor what a pipeline's
+            camera takes to deliver a frame.
     """
 
     mismatch_sum: Ints
@@ -123,9 +125,13 @@ class Staleness:
     longest_stale: Floats
 
     @classmethod
-    def of(cls, pairing: Pairing) -> Staleness:
-        """That of paired outputs and queries."""
-        return cls(*(getattr(pairing, field.name) for field in fields(cls)))
+    def of(cls, pairing: Pairing, schedules: Schedules) -> Staleness:
+        """That of paired outputs and queries, and of their schedules."""
+        found = cls(*(getattr(pairing, field.name) for field in fields(cls)))
+        for s, schedule in enumerate(schedules.whole or ()):
+            if schedule.delivered is not None:
+                found.age_sum[s], found.age_max[s] = pairing.ages_from(s, schedule.delivered)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -505,7 +511,7 @@ class _Scoring:
             for observer in self.observers:
                 observer(one)
         replay = _replay_statistics(runs, offline, which)
-        staleness = Staleness.of(pairings[0])
+        staleness = Staleness.of(pairings[0], runs.schedules)
         failure_time = np.where(failure < 0, -1.0, failed_at)
         curves, offline_curves = (
             Curves(

@@ -170,6 +170,28 @@ class Pairing:
 
         return self._longest(self.mismatch_max, span)
 
+    def ages_from(self, sequence: int, arrived: Ints) -> tuple[Floats, Floats]:
+        """Sum and largest of the ages of a sequence whose frames arrive later than they show.
+
+        Args:
+            sequence: its place.
+            arrived: when each of its frames did, int64 [T], ticks.
+
+        Returns:
+            As :attr:`age_sum` and :attr:`age_max`, float64 [M] each.
+        """
+        clock, outputs = self.clocks[sequence], self._outputs(sequence)
+        asked = clock.arrival(np.arange(self.lengths[sequence])) // clock.ticks_per_ns
+        since = (arrived // clock.ticks_per_ns)[self.frames[outputs]]
+        since[0] = asked[0]  # the initial box is there from the start
+        first, end = self.first[outputs].astype(np.int64), self.end[outputs].astype(np.int64)
+        ages = np.where(end > first, asked[np.maximum(end - 1, 0)] - since[:, None], 0)
+        per_ns = clock.ticks_per_ns / clock.frame_ticks
+        return (asked.sum() - since @ (end - first)) * per_ns, ages.max(axis=0) * per_ns
+
+    def _outputs(self, sequence: int) -> slice:
+        return slice(int(self.offsets[sequence]), int(self.offsets[sequence + 1]))
+
     @property
     def longest_stale(self) -> Floats:
         """Longest time that one output answered, nominal frame intervals, float64 [S, M].

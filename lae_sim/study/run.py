@@ -23,6 +23,7 @@ from lae_sim.evaluation.caveats import at_the_floor, floor_notes
 from lae_sim.files import check_distinct, csv_cell, text_digest, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
+from lae_sim.replay.pipeline import times_named
 from lae_sim.study.cells import Result, Task
 from lae_sim.study.comparisons import PairsFile, Rivals, rivals_of
 from lae_sim.study.deployment import Curve, Search, requirement, searches
@@ -291,7 +292,8 @@ def compute_study(
         LaeError: if the study cannot be planned, nothing could be computed, or a worker died.
     """
     plan = make_plan(study, base)
-    names = (*study.forecasters, *filter(None, study.pre_forecaster), *study.policies, *study.times)
+    names = [*study.forecasters, *filter(None, study.pre_forecaster), *study.policies]
+    names += [*study.times, *(time for each in study.pipelines for time in times_named(each))]
     files = [file for name in names for file in files_named(name)]
     check_inputs(folder, [*(source.input.path for source in plan.sources), *files])
     store = Store(folder)
