@@ -34,6 +34,7 @@ from lae_sim.report.table import (
     write_csv,
     write_parquet,
 )
+from lae_sim.trace.columns import from_values
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -259,7 +260,9 @@ def _write_records(records: Records, csv_path: Path, parquet_path: Path) -> None
                         for name in floats}  # fmt: skip
                 quoted = row | {name: csv_cell(row.get(name)) for name in texts}
                 lines.writerow([quoted.get(name) for name in records.names])
-            waiting.append(pa.Table.from_pylist(some, schema))  # a fraction of the rows' memory
+            columns = [[row.get(name) for row in some] for name in records.names]
+            arrays = [*map(from_values, columns, schema.types)]
+            waiting.append(pa.Table.from_arrays(arrays, schema=schema))
             if len(waiting) == _CHUNKS:
                 writer.write_table(pa.concat_tables(waiting))
                 waiting.clear()
