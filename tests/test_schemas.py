@@ -76,8 +76,11 @@ def test_compare() -> None:
 
 
 def test_show(gaps: Path) -> None:
-    staged = TRACES / "cases" / "valid" / "stages.parquet"
-    *_, of_stages, last = printed("show", SLOW, REAL_TIME, staged, gaps)["traces"]
+    staged, full = (
+        TRACES / "cases" / "valid" / f"{n}.parquet" for n in ("stages", "full-metadata")
+    )
+    measured, *_, of_stages, last = printed("show", full, SLOW, REAL_TIME, staged, gaps)["traces"]
+    assert measured["provenance"]["device"]["energy"]["joules_per_frame"] == 0.19
     assert [row["stage"] for row in of_stages["times"]["stages"]] == ["decode", "inference", None]
     assert last["reach"]["bins"]
 

@@ -161,10 +161,40 @@ def write_valid(folder: Path) -> None:
             "settings": {"scale": 2},
             "search": {"half_side": 1.25, "window": True, "source": "crops of 128 and 256 pixels"},
         },
-        "device": {"model": "board", "power_mode": "15W"},
+        "device": {
+            "model": "board",
+            "power_mode": "15W",
+            "energy": {
+                "calls": 4,
+                "seconds": 0.08,
+                "power_w": {"VDD_IN": 9.5, "VDD_SOC": 1.25},
+                "idle_w": {"VDD_IN": 5.0, "VDD_SOC": 1.0},
+                "total": ["VDD_IN"],
+                "joules_per_frame": 0.19,
+                "joules_per_frame_above_idle": 0.09,
+            },
+            "clocks": {"cpu_mhz": 1728.0, "gpu_mhz": 918.0},
+            "slowdowns": {"software power cap": 0.25},
+            "unread": {"VDD_SOC": 0.1},
+            "beside": [
+                {
+                    "command": "./encode.sh",
+                    "exit": 1,
+                    "seconds": 2.5,
+                    "sequences": 1,
+                    "of_sequences": 2,
+                }
+            ],
+        },
         "timing": {"source": "measured", "clock": "perf_counter_ns", "warmup_calls": 3},
         "dataset": {"name": "example"},
-        "sequences": {"a": {"image_size": [640, 480], "attributes": ["Occlusion"]}},
+        "sequences": {
+            "a": {
+                "image_size": [640, 480],
+                "attributes": ["Occlusion"],
+                "sampled": {"calls": 2, "seconds": 0.04, "power_w": {"VDD_IN": 9.5}},
+            }
+        },
         "a key of the future": [1, {"x": None}],
     }
     dictionary = pa.dictionary(pa.int32(), pa.string())
