@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
-from itertools import groupby, islice
+from itertools import groupby
 from operator import itemgetter
 from typing import Any, TypeAlias, TypeVar
 
@@ -521,7 +521,7 @@ class _Scoring:
             for some in (scored, offline)
         )
         offline_scores = np.array([each.scores for each in offline])
-        outcomes = self._outcomes(runs, known, scores)
+        outcomes = self._outcomes(runs, pairings, known, scores)
         end = 0
         for part in parts:
             begin, end = end, end + len(part)
@@ -556,25 +556,33 @@ class _Scoring:
         return scored
 
     def _outcomes(
-        self, runs: RunBatch, known: _Known, recorded: Mapping[str, Floats]
+        self,
+        runs: RunBatch,
+        pairings: Mapping[int, Pairing],
+        known: _Known,
+        recorded: Mapping[str, Floats],
     ) -> list[dict[str, Floats]]:
-        """The scores of the search model's outcomes (see :func:`.modelled.modelled_scores`)."""
+        """The scores of the search model's outcomes (see :func:`.modelled.modelled_scores`).
+
+        They are of the runs' schedules, so that they are paired with queries as the runs are.
+        """
         scores: list[dict[str, Floats]] = [{} for _ in runs.modelled]
-        others = []
+        others: list[tuple[int, int]] = []  # that are not as recorded
+        offsets = runs.schedules.offsets.tolist()
         for s, outcomes in enumerate(runs.modelled):
             if outcomes is None:
                 continue
-            run, boxes = runs[s], outcomes.boxes
+            boxes, own = outcomes.boxes, runs.boxes[offsets[s] : offsets[s + 1]]
             scores[s] = {m: np.stack([recorded[m][:, s]] * len(boxes), 1) for m in MODELLED}
-            for r, each in enumerate(boxes):
-                if not np.array_equal(each, run.boxes):
-                    others.append((s, r, replace(run, boxes=each)))
-        costs = {self.costs.get(name, 0) for name in self.forecasters}
-        unobserved, places = replace(self, observed=()), iter(others)
-        for group in grouped([run for *_, run in others], GROUP_FRAMES):
-            pairings = {cost: pair(group.schedules, self.sigmas, cost) for cost in costs}
-            scored = unobserved._scored(group, pairings, known, [])
-            for i, (s, r, _) in enumerate(islice(places, len(group))):
+            others += [(s, r) for r, each in enumerate(boxes) if not np.array_equal(each, own)]
+        unobserved = replace(self, observed=())
+        for some in _filled(others, runs.schedules.lengths, GROUP_FRAMES):
+            which = np.array([s for s, _ in some])
+            answered = [outcome.boxes[r] for s, r in some if (outcome := runs.modelled[s])]
+            own_pairings = {cost: each.of_sequences(which) for cost, each in pairings.items()}
+            group = runs.answering(which, answered)
+            scored = unobserved._scored(group, own_pairings, known, [])
+            for i, (s, r) in enumerate(some):
                 for metric in MODELLED:
                     scores[s][metric][:, r] = [each.scores[metric][i] for each in scored]
         return scores
@@ -593,6 +601,22 @@ class _Scoring:
                 for place, one in _answers_at(self.sigmas.index(sigma), pairing, part):
                     kept[place][name, sigma] = one
             yield part
+
+
+def _filled(
+    outcomes: Iterable[tuple[int, int]], lengths: Ints, frames: int
+) -> Iterator[list[tuple[int, int]]]:
+    """Outcomes of sequences, which come first, in groups of about so many world frames."""
+    group: list[tuple[int, int]] = []
+    pending = 0
+    for each in outcomes:
+        group.append(each)
+        pending += int(lengths[each[0]]) + BESIDE
+        if pending >= frames:
+            yield group
+            group, pending = [], 0
+    if group:
+        yield group
 
 
 def _replay_statistics(

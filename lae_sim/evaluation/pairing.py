@@ -96,6 +96,23 @@ class Pairing:
             self.clocks[sequence : sequence + 1],
         )
 
+    def of_sequences(self, which: Ints) -> Pairing:
+        """That of some sequences, by their indices, perhaps of one several times."""
+        sizes = np.diff(self.offsets)[which]
+        outputs = ranges(self.offsets[which], sizes)
+        return Pairing(
+            self.lengths[which],
+            np.concatenate([[0], np.cumsum(sizes)]),
+            self.frames.take(outputs),
+            None if self.steps is None else self.steps.take(outputs),
+            None if self.next_steps is None else self.next_steps.take(outputs),
+            self.scale,
+            self.sigmas,
+            self.first.take(outputs, axis=0),
+            self.end.take(outputs, axis=0),
+            tuple(self.clocks[s] for s in which.tolist()),
+        )
+
     @cached_property
     def mismatch_sum(self) -> Ints:
         """Sum of i - psi(i) over the world frames of each sequence, frames, int64 [S, M]."""

@@ -184,6 +184,23 @@ class RunBatch:
             self.repetition[some],
         )
 
+    def answering(self, which: Ints, boxes: Sequence[Floats]) -> RunBatch:
+        """Some of them, perhaps one several times, with other boxes than theirs.
+
+        Args:
+            which: places of runs, int64 [R].
+            boxes: of each the boxes, float64 [n, 4].
+        """
+        return RunBatch(
+            tuple(self.recordings[r] for r in which.tolist()),
+            Schedules.of([self.schedules[r] for r in which.tolist()]),
+            np.concatenate(boxes),
+            self.departures[which],
+            self.disagreement[which],
+            (None,) * len(which),
+            self.repetition[which],
+        )
+
     @classmethod
     def of(cls, runs: Sequence[Run]) -> RunBatch:
         """Some runs, at least one, as a batch."""

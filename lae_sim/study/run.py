@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -139,18 +138,30 @@ class StudyResults:
         return pd.DataFrame(flat_rows(self.summary))
 
     def scores_frame(self) -> DataFrame:
-        """The summary with all numbers as numbers.
+        """The summary with all numbers as numbers: the table of :meth:`score_rows`."""
+        import pandas as pd
+
+        return pd.DataFrame(self.score_rows(), columns=self.score_names())
+
+    def score_names(self) -> list[str]:
+        """The columns of :meth:`score_rows`."""
+        flat = (record.flat() for record in self.summary)
+        return [*dict.fromkeys(chain.from_iterable(flat)), "over_sigmas"]
+
+    def score_rows(self) -> Iterator[dict[str, Any]]:
+        """The rows of the summary with all numbers as numbers.
 
         World rates and scales are floats, and so is sigma, which is unknown where scores are means
         over the grid of sigmas; ``over_sigmas`` says so.
         """
-        table = self.summary_frame()
-        numbers = {
-            name: [float(Fraction(text)) for text in table[name]] for name in ("fps", "scale")
-        }
-        over = table["sigma"] == MEAN
-        sigma = [math.nan if text == MEAN else float(Fraction(text)) for text in table["sigma"]]
-        return table.assign(**numbers, sigma=sigma, over_sigmas=over)
+        for record in self.summary:
+            over = record.sigma == MEAN
+            numbers = {
+                "fps": float(record.fps),
+                "scale": float(record.scale),
+                "sigma": math.nan if over else float(record.sigma),
+            }
+            yield {**record.flat(), **numbers, "over_sigmas": over}
 
     def __repr__(self) -> str:
         cells, failed = len(self.plan.cells), len(self.failures)
