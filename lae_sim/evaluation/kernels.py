@@ -16,6 +16,23 @@ _AT_ONCE = 256  # pairs whose boxes stay in the first cache
 
 
 @kernel
+def _quotient(value: int, divisor: int, inverse: float) -> int:
+    """``value // divisor``: a division of integers takes as long as all that is around it.
+
+    Args:
+        value: a whole number.
+        divisor: above zero.
+        inverse: 1 / divisor.
+    """
+    quotient = int(value * inverse)  # off by one, or by a few where it has more than 52 bits
+    while quotient * divisor > value:
+        quotient -= 1
+    while value - quotient * divisor >= divisor:
+        quotient += 1
+    return quotient
+
+
+@kernel
 def first_steps(ready: Ints, interval: int, scale: int, steps: Ints) -> None:
     """The step from which each output is visible: ceil(scale * ready / interval).
 
@@ -25,10 +42,11 @@ def first_steps(ready: Ints, interval: int, scale: int, steps: Ints) -> None:
         scale: see :class:`.pairing.Pairing`.
         steps: written, int64 [n].
     """
+    inverse = 1.0 / interval
     for o in range(len(ready)):
-        frame = ready[o] // interval
+        frame = _quotient(ready[o], interval, inverse)
         late = ready[o] - frame * interval
-        steps[o] = frame * scale - (-late * scale // interval)
+        steps[o] = frame * scale - _quotient(-late * scale, interval, inverse)
 
 
 @kernel
@@ -49,10 +67,11 @@ def first_visible(
         whole, part: the permitted latencies in whole frames, and the steps beyond, int64 [M].
         first, end: see :class:`.pairing.Pairing`: written, int32 [n, M].
     """
+    inverse = 1.0 / scale
     for s in range(len(lengths)):
         length = lengths[s]
         for o in range(offsets[s], offsets[s + 1]):
-            frame = steps[o] // scale
+            frame = _quotient(steps[o], scale, inverse)
             rest = steps[o] - frame * scale
             for m in range(len(whole)):
                 since = min(max(frame - whole[m] + (rest > part[m]), 0), length)
@@ -64,10 +83,13 @@ def first_visible(
 
 @kernel
 def sum_gaps(
+    lengths: Ints,
     offsets: Ints,
     frames: Ints,
-    first: Frames,
-    end: Frames,
+    steps: Ints,
+    scale: int,
+    whole: Ints,
+    part: Ints,
     source_sum: Ints,
     mismatch: Ints,
     hold: Ints,
@@ -75,20 +97,32 @@ def sum_gaps(
     """Sums and largest distances of frames in each sequence at each permitted latency.
 
     Args:
-        offsets, frames, first, end: see :class:`.pairing.Pairing`.
+        lengths, offsets, frames, steps, scale: see :class:`.pairing.Pairing`.
+        whole, part: see :func:`first_visible`.
         source_sum, mismatch, hold: see :class:`.pairing._Gaps`: written, int64 [S, M].
     """
     source_sum[:] = 0
     mismatch[:] = 0
     hold[:] = 0
-    for s in range(len(offsets) - 1):
+    inverse = 1.0 / scale
+    first = np.empty(len(whole), np.int64)
+    for s in range(len(lengths)):
+        length = lengths[s]
+        first[:] = 0
         for o in range(offsets[s], offsets[s + 1]):
-            frame = frames[o]
-            for m in range(first.shape[1]):
-                answered = end[o, m] - first[o, m]
-                source_sum[s, m] += answered * frame
-                mismatch[s, m] = max(mismatch[s, m], end[o, m] - frame - 1)
+            is_last = o + 1 == offsets[s + 1]
+            following = 0 if is_last else steps[o + 1]
+            frame = _quotient(following, scale, inverse)
+            rest = following - frame * scale
+            for m in range(len(whole)):
+                end = length
+                if not is_last:
+                    end = min(max(frame - whole[m] + (rest > part[m]), 0), length)
+                answered = end - first[m]
+                source_sum[s, m] += answered * frames[o]
+                mismatch[s, m] = max(mismatch[s, m], end - frames[o] - 1)
                 hold[s, m] = max(hold[s, m], answered)
+                first[m] = end
 
 
 @kernel
