@@ -19,7 +19,7 @@ from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention, is_scored
 from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_scores
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scored, Scorer
-from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
+from lae_sim.forecast.base import AnyFactory, Hold, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run, RunBatch, distinct, grouped, regrouped
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes, Metadata
@@ -544,6 +544,12 @@ class _Scoring:
         which, scored = known.which(runs), []
         for name, factory in self.forecasters.items():
             pairing = pairings[self.costs.get(name, 0)]
+            if factory is Hold and name not in map(itemgetter(0), self.observed):
+                of_runs = runs.boxes, runs.own
+                held = known.scorer.held(which, pairing, *of_runs, self.curves_at)
+                if held is not None:
+                    scored.append(held)
+                    continue
             parts = _answers(runs, self.image_sizes, pairing, name, factory)
             parts = self._observed(parts, pairing, name, kept)
             scored.append(known.scorer.of(which, parts, len(self.sigmas), self.curves_at))

@@ -11,7 +11,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from lae_sim._arrays import Floats, Ints
+from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import PARTED_IOU, iou
 from lae_sim.engine.arrivals import same_arrivals, with_arrivals
 from lae_sim.engine.clock import Clock
@@ -141,6 +141,7 @@ class RunBatch:
         departures, disagreement: see :class:`Run`, int64 [R] and float64 [R].
         modelled: see :class:`Run`.
         repetition: of each, int64 [R]; 0 where times are not drawn again and again.
+        own: whether a run's boxes are known to be those of its recording, bool [R].
     """
 
     recordings: tuple[Recording, ...]
@@ -150,6 +151,7 @@ class RunBatch:
     disagreement: Floats
     modelled: tuple[Outcomes | None, ...]
     repetition: Ints
+    own: Bools
 
     def __len__(self) -> int:
         """Number of runs R."""
@@ -181,6 +183,7 @@ class RunBatch:
             self.disagreement[some],
             self.modelled[some],
             self.repetition[some],
+            self.own[some],
         )
 
     @classmethod
@@ -194,6 +197,7 @@ class RunBatch:
             np.array([run.disagreement for run in runs]),
             tuple(run.modelled for run in runs),
             np.zeros(len(runs), np.int64),
+            np.zeros(len(runs), np.bool_),
         )
 
     @classmethod
@@ -209,6 +213,7 @@ class RunBatch:
             np.concatenate([part.disagreement for part in parts]),
             tuple(chain.from_iterable(part.modelled for part in parts)),
             np.concatenate([part.repetition for part in parts]),
+            np.concatenate([part.own for part in parts]),
         )
 
     @cached_property
@@ -219,13 +224,11 @@ class RunBatch:
 
 def distinct(items: Iterable[Item]) -> tuple[list[Item], Ints]:
     """Objects, each once, in the order of their first places, and where each stands, int64 [n]."""
-    found: dict[int, Item] = {}
-    places: dict[int, int] = {}
-    which = []
-    for item in items:
-        found[id(item)] = item
-        which.append(places.setdefault(id(item), len(places)))
-    return list(found.values()), np.array(which, np.int64)
+    items = list(items)
+    names = list(map(id, items))
+    found = dict(zip(names, items))
+    places = dict(zip(found, range(len(found))))
+    return list(found.values()), np.fromiter(map(places.__getitem__, names), np.int64, len(items))
 
 
 @runtime_checkable
@@ -402,6 +405,7 @@ def _run(jobs: Sequence[_Job], schedules: Schedules, repetition: Ints) -> RunBat
         disagreement,
         tuple(modelled),
         repetition,
+        np.array([each is job.own for each, job in zip(used, jobs)]),
     )
 
 
