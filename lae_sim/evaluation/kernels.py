@@ -184,6 +184,14 @@ def most_pairs(
 
 
 @kernel
+def _place(sigmas: Ints, value: int) -> int:
+    """How many sigmas are below a value; where they are dense it may be out of range."""
+    if sigmas[-1] - sigmas[0] == len(sigmas) - 1:
+        return value - int(sigmas[0])
+    return int(np.searchsorted(sigmas, value))
+
+
+@kernel
 def list_pairs(
     offsets: Ints,
     output: Ints,
@@ -208,8 +216,6 @@ def list_pairs(
         How many there are.
     """
     items, frames, froms, tos = pairs[0], pairs[1], pairs[2], pairs[3]
-    count = len(sigmas)
-    dense = sigmas[-1] - sigmas[0] == count - 1
     n = 0
     for h in range(len(offsets) - 1):
         low, high = sigma_from[h], sigma_to[h]
@@ -219,12 +225,7 @@ def list_pairs(
                 from_, to = low, high
                 if high - low > 1:
                     since, until = steps[o] - scale * frame, next_steps[o] - scale * frame
-                    if dense:
-                        since, until = since - sigmas[0], until - sigmas[0]
-                    else:
-                        since = np.searchsorted(sigmas, since)
-                        until = np.searchsorted(sigmas, until)
-                    from_, to = max(since, low), min(until, high)
+                    from_, to = max(_place(sigmas, since), low), min(_place(sigmas, until), high)
                 if from_ < to:
                     items[n], frames[n], froms[n], tos[n] = item, frame, from_, to
                     n += 1
@@ -340,7 +341,7 @@ def _tally(
             auc = dp20 = norm_dp20 = norm_auc = within50 = 0
             s, low, high = sequence[k], sigma_from[k], sigma_to[k]
             shown = low <= curves_at < high
-        packed = np.int64(worth[k])
+        packed = int(worth[k])
         passed, within = packed & 511, packed >> 9 & 63
         auc += passed
         dp20 += within > 30
@@ -427,14 +428,6 @@ def count_pairs(
             precision,
             failure,
         )
-
-
-@kernel
-def _place(sigmas: Ints, value: int) -> int:
-    """How many sigmas are below a value; fewer than none, or more than all, where they are dense."""
-    if sigmas[-1] - sigmas[0] == len(sigmas) - 1:
-        return value - sigmas[0]
-    return np.searchsorted(sigmas, value)
 
 
 @kernel
@@ -531,9 +524,7 @@ def count_held(
                     unknown += 1
                 n += 1
                 if n == _AT_ONCE:
-                    _measure(
-                        known, answered, unknown, valid, leaves_out, by_centre, steps, fresh
-                    )
+                    _measure(known, answered, unknown, valid, leaves_out, by_centre, steps, fresh)
                     _learn(fresh, new[:unknown], lags, bases, sequence, frame, worth, found)
                     _tally(
                         worth,
