@@ -603,8 +603,8 @@ def _replay_statistics(
     firsts = schedules.offsets[:-1]
     elapsed = (schedules.ready - schedules.start) // schedules.clocks[0].ticks_per_ns
     init_ns = elapsed[firsts]
-    rates = np.full(len(elapsed), np.inf)
-    np.divide(1e9, elapsed, out=rates, where=elapsed > 0)
+    with np.errstate(divide="ignore"):
+        rates = 1e9 / elapsed  # infinite where a call took 0
     # zeros in place of initialisations: what is summed up are the other calls, in their order
     elapsed[firsts], rates[firsts] = 0, 0.0
     return ReplayStatistics(

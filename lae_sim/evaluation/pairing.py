@@ -280,7 +280,8 @@ def pair(
         raise LaeError(f"forecasting cannot cost {cost_ns} ns, less than nothing")
     cost = cost_ns * clocks[0].ticks_per_ns
     visible = schedules.visible
-    last_ready = int(visible[visible < NEVER].max()) + cost
+    seen = visible if schedules.whole is None else visible[visible < NEVER]
+    last_ready = int(seen.max()) + cost
     if last_ready > MAX_INT64:
         raise LaeError(f"forecasting cannot cost {cost_ns:g} ns: the clock ends before")
     largest = max(last_ready // interval, int(lengths.max())) * scale
@@ -291,13 +292,14 @@ def pair(
             "large for exact 64-bit arithmetic: use fewer digits"
         )
     frames = schedules.frames
-    overlaps = schedules.start[1:] < schedules.ready[:-1]
-    overlaps[offsets[1:-1] - 1] = False
-    if not at_once and schedules.whole is None and overlaps.any():
-        raise LaeError(
-            "calls overlap, as under the rule of VOT, which never scores latency: such a policy "
-            "says so by an attribute, scores_latency = False"
-        )
+    if not at_once and schedules.whole is None:
+        overlaps = schedules.start[1:] < schedules.ready[:-1]
+        overlaps[offsets[1:-1] - 1] = False
+        if overlaps.any():
+            raise LaeError(
+                "calls overlap, as under the rule of VOT, which never scores latency: such a "
+                "policy says so by an attribute, scores_latency = False"
+            )
     m = np.array(numerators, np.int64)
     steps: Ints | None = None
     arrived: Frames | None = None
@@ -306,7 +308,8 @@ def pair(
             steps = frames * scale
         else:
             steps = _steps(visible + cost, interval, scale)
-            steps[visible == NEVER] = _NEVER
+            if len(seen) < len(visible):
+                steps[visible == NEVER] = _NEVER
         steps[offsets[:-1]] = -_NEVER
     else:
         permitted = [each * interval // scale for each in numerators]
@@ -315,8 +318,8 @@ def pair(
         since = np.array(permitted, np.int64)
         arrived = np.concatenate(
             [
-                _first_arrived(s, s.clock.arrival(s.frames) if at_once else seen + cost, since)
-                for s, seen in zip(schedules, np.split(visible, offsets[1:-1]))
+                _first_arrived(s, s.clock.arrival(s.frames) if at_once else its + cost, since)
+                for s, its in zip(schedules, np.split(visible, offsets[1:-1]))
             ]
         )
     return Pairing(lengths, offsets, frames, steps, scale, m, clocks, arrived)

@@ -134,7 +134,7 @@ def test_boxes_of_another_pass_are_not_taken_for_the_recordings_own() -> None:
     own, other = (recording("a", random, False) for _ in range(2))
     other = replace(own, boxes=own.boxes + 3.0)
     metadata = Metadata.new("30", "every-frame")
-    strided = replace(metadata, stride=Fraction(2))
+    strided = Metadata.new("30", "every-frame", schedule={"stride": "2"})
     trace, second = Trace(metadata, [own]), Trace(strided, [other])
     found: list[bool] = []
     for latency in ("constant:1ms", "constant:60ms"):
