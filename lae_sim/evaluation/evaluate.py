@@ -545,7 +545,7 @@ class _Scoring:
         for name, factory in self.forecasters.items():
             pairing = pairings[self.costs.get(name, 0)]
             if factory is Hold and name not in map(itemgetter(0), self.observed):
-                of_runs = runs.boxes, runs.own
+                of_runs = runs.table, runs.row, runs.own
                 held = known.scorer.held(which, pairing, *of_runs, self.curves_at)
                 if held is not None:
                     scored.append(held)

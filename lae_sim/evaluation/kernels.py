@@ -459,7 +459,8 @@ def count_held(
     own_steps: Ints,
     scale: int,
     sigmas: Ints,
-    boxes: Floats,
+    table: Floats,
+    row: Ints,
     own: Bools,
     found: Frames,
     valid: int,
@@ -478,7 +479,7 @@ def count_held(
     Args:
         bases, truth, and all from ``valid`` on: see :func:`count_pairs`.
         lengths, offsets, frames, own_steps, scale, sigmas: see :class:`.pairing.Pairing`.
-        boxes: of each output, float64 [n, 4].
+        table, row: boxes, float64 [N, 4], and the row of each output's, int64 [n].
         own: whether a sequence's boxes are those of the recording that its truth is of, bool [S].
         found: what the box of the frame 0, 1, 2, ... frames before counts, of such a recording, 0
             where that is not known yet: read and written, int32 [..., lags].
@@ -519,7 +520,7 @@ def count_held(
                 sequence[n], frame[n], sigma_from[n], sigma_to[n] = s, i, low, high
                 if packed == 0:
                     is_truth = first_frame_is_truth and i == 0
-                    _gather(truth, base + i, boxes[o], is_truth, known, answered, unknown)
+                    _gather(truth, base + i, table[row[o]], is_truth, known, answered, unknown)
                     new[unknown], lags[unknown] = n, lag
                     unknown += 1
                 n += 1

@@ -85,7 +85,13 @@ class Scorer:
         )
 
     def held(
-        self, which: Ints, pairing: Pairing, boxes: Floats, own: Bools, curves_at: int = 0
+        self,
+        which: Ints,
+        pairing: Pairing,
+        table: Floats,
+        row: Ints,
+        own: Bools,
+        curves_at: int = 0,
     ) -> Scored | None:
         """Score the latest output's box as the answer to each query, in one kernel.
 
@@ -94,14 +100,14 @@ class Scorer:
         Args:
             which: the recording of each sequence, by its place, int64 [S].
             pairing: of the sequences.
-            boxes: of their outputs, float64 [n, 4].
+            table, row: boxes, float64 [N, 4], and the row of each output's, int64 [n].
             own: whether a sequence's boxes are those of its recording, bool [S].
             curves_at: index of a permitted latency.
 
         Returns:
             None where there are no kernels, or not for this.
         """
-        replaces = self._convention.keeps_answer and not is_box(boxes).all()
+        replaces = self._convention.keeps_answer and not is_box(table).all()
         if pairing.steps is None or replaces or not compiled():
             return None
         from lae_sim.evaluation.kernels import count_held
@@ -118,7 +124,8 @@ class Scorer:
             pairing.steps,
             pairing.scale,
             pairing.sigmas,
-            np.ascontiguousarray(boxes),
+            np.ascontiguousarray(table),
+            row,
             own & repeats,
             self._found if repeats else np.empty((0, 0), np.int32),
             *self._rule,

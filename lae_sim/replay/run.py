@@ -137,7 +137,8 @@ class RunBatch:
     Attributes:
         recordings: of each run.
         schedules: of the runs, with n processed frames.
-        boxes: see :class:`Run`, float64 [n, 4].
+        table: boxes, those that the runs have and perhaps others, float64 [N, 4].
+        row: the row of each processed frame's box in it, int64 [n].
         departures, disagreement: see :class:`Run`, int64 [R] and float64 [R].
         modelled: see :class:`Run`.
         repetition: of each, int64 [R]; 0 where times are not drawn again and again.
@@ -146,7 +147,8 @@ class RunBatch:
 
     recordings: tuple[Recording, ...]
     schedules: Schedules
-    boxes: Floats
+    table: Floats
+    row: Ints
     departures: Ints
     disagreement: Floats
     modelled: tuple[Outcomes | None, ...]
@@ -162,7 +164,7 @@ class RunBatch:
         return Run(
             self.recordings[r],
             self.schedules[r],
-            self.boxes[self.schedules.offsets[r] : self.schedules.offsets[r + 1]],
+            self.table.take(self.row[slice(*self.schedules.offsets[r : r + 2])], axis=0),
             int(self.departures[r]),
             float(self.disagreement[r]),
             self.modelled[r],
@@ -178,7 +180,8 @@ class RunBatch:
         return RunBatch(
             self.recordings[some],
             self.schedules.part(begin, end),
-            self.boxes[offsets[begin] : offsets[end]],
+            self.table,
+            self.row[offsets[begin] : offsets[end]],
             self.departures[some],
             self.disagreement[some],
             self.modelled[some],
@@ -192,7 +195,8 @@ class RunBatch:
         return cls(
             tuple(run.recording for run in runs),
             Schedules.of([run.schedule for run in runs]),
-            np.concatenate([run.boxes for run in runs]),
+            boxes := np.concatenate([run.boxes for run in runs]),
+            np.arange(len(boxes)),
             np.array([run.departures for run in runs], np.int64),
             np.array([run.disagreement for run in runs]),
             tuple(run.modelled for run in runs),
@@ -205,16 +209,26 @@ class RunBatch:
         """Several batches as one."""
         if len(parts) == 1:
             return parts[0]
+        tables, which = distinct(part.table for part in parts)
+        sizes = [len(table) for table in tables]
+        begins = (np.cumsum(sizes) - sizes)[which].tolist()
         return cls(
             tuple(chain.from_iterable(part.recordings for part in parts)),
             Schedules.joined([part.schedules for part in parts]),
-            np.concatenate([part.boxes for part in parts]),
+            np.concatenate(tables) if len(tables) > 1 else tables[0],
+            np.concatenate([part.row + begin for part, begin in zip(parts, begins)]),
             np.concatenate([part.departures for part in parts]),
             np.concatenate([part.disagreement for part in parts]),
             tuple(chain.from_iterable(part.modelled for part in parts)),
             np.concatenate([part.repetition for part in parts]),
             np.concatenate([part.own for part in parts]),
         )
+
+    @cached_property
+    def boxes(self) -> Floats:
+        """The box of each processed frame, float64 [n, 4]."""
+        boxes: Floats = self.table.take(self.row, axis=0)
+        return boxes
 
     @cached_property
     def distinct(self) -> tuple[list[Recording], Ints]:
@@ -379,9 +393,9 @@ def _run(jobs: Sequence[_Job], schedules: Schedules, repetition: Ints) -> RunBat
     lengths = np.array([len(each.recording) for each in tables], np.int64)
     row: Ints = np.repeat((np.cumsum(lengths) - lengths)[which], np.diff(schedules.offsets))
     row += schedules.frames
-    boxes = np.concatenate([each.recording.boxes for each in tables]).take(row, axis=0)
-    absent = np.isnan(boxes[:, 0])
-    if absent.any():
+    table = np.concatenate([each.recording.boxes for each in tables])
+    absent = np.isnan(table[:, 0])
+    if absent.any() and (absent := absent.take(row)).any():
         r = int(np.searchsorted(ends, absent.argmax(), "right"))
         _boxes(used[r].recording, schedules.frames[of_run[r]])
     departs = np.concatenate([each.before for each in tables]).take(row)
@@ -393,14 +407,16 @@ def _run(jobs: Sequence[_Job], schedules: Schedules, repetition: Ints) -> RunBat
     for r, job in enumerate(jobs):
         if not job.passes and job.search is None:
             continue
-        own = used[r], schedules.frames[of_run[r]], boxes[of_run[r]], int(departures[r])
+        boxes = table.take(row[of_run[r]], axis=0)
+        own = used[r], schedules.frames[of_run[r]], boxes, int(departures[r])
         if job.passes:
             disagreement[r] = job.disagreement(*own)
         modelled[r] = job.modelled(*own)
     return RunBatch(
         tuple(job.recording for job in jobs),
         schedules,
-        boxes,
+        table,
+        row,
         departures,
         disagreement,
         tuple(modelled),
