@@ -685,7 +685,7 @@ def lanes_of(
     """
     numbers = pairing.frames.take(fed.output)
     frames = pairing.frame_times(np.repeat(fed.sequence, np.diff(fed.offsets)), numbers)
-    fed_boxes = runs.boxes.take(fed.output, axis=0)
+    fed_boxes = runs.table.take(runs.row.take(fed.output), axis=0)
     recordings, which = runs.distinct
     first = np.full((len(recordings), 2), np.inf)
     resized: dict[int, ImageSizes] = {}

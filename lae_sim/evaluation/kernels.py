@@ -24,6 +24,8 @@ def _quotient(value: int, divisor: int, inverse: float) -> int:
         divisor: above zero.
         inverse: 1 / divisor.
     """
+    if divisor == 1:
+        return value
     quotient = int(value * inverse)  # off by one, or by a few where it has more than 52 bits
     while quotient * divisor > value:
         quotient -= 1

@@ -180,8 +180,8 @@ def test_kernels_are_what_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(5)
     some = [replay_sequence(recording("a", random, False), CLOCK)]
     used = []
-    names = ("sum_gaps", "changes", "used_outputs", "most_pairs", "list_pairs", "count_pairs")
-    names += ("count_held",)
+    counting = ("count_pairs", "count_held")
+    names = ("sum_gaps", "changes", "used_outputs", "most_pairs", "list_pairs", *counting)
     both = {"hold": Hold, "kalman": Kalman}
     for name in names:
         kernel = getattr(kernels, name)
