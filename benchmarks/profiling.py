@@ -18,12 +18,16 @@ from pathlib import Path
 import numpy as np
 from targets import Line
 
+from lae_sim.profile.device import text
+from lae_sim.profile.sampler import Sampler
+from lae_sim.profile.sensors import Sensor
 from lae_sim.profile.timed import TimedTracker
 from lae_sim.profile.worker import InProcess, Worker
 from lae_sim.trackers.protocol import Image
 
 WORKS_NS = {1_000_000: "stopwatch", 5_000_000: "stopwatch-5ms"}  # and what may be read beyond
 SIZES = ((640, 480), (1920, 1080))
+FILE = Path("/proc/loadavg")  # of the size of a sensor's
 HEAD = ("tracker", "what", "median", "ratio to the work", "target")
 
 
@@ -81,7 +85,22 @@ def measured(quick: bool) -> list[Line]:
                 Line([what, "around it", f"{around / 1e3:.0f} us", f"{around / work:.4f}"]),
                 Line([what, "(a copy of the frame)", f"{copy / 1e3:.0f} us", f"{copy / work:.4f}"]),
             ]
-    return found
+    return [*found, sampled(frame, 100 if quick else 400)]
+
+
+def sampled(frame: Image, calls: int) -> Line:
+    """The line of a 5 ms tracker while the device's power and clocks are read, from 8 files."""
+    sensors = [Sensor(str(n), "power", lambda: float(len(text(FILE)))) for n in range(8)]
+    with (
+        beside_this(),
+        Sampler(sensors) as sampler,
+        Worker("profiling:Busy", {"work_ns": 5_000_000}) as tracker,
+    ):
+        _, work, beyond = medians(tracker, frame, calls)
+    what = f"5 ms, {frame.shape[1]}x{frame.shape[0]}, worker process, sensors read"
+    assert sampler.readings
+    figures = f"{beyond / 1e3:.1f} us", f"{beyond / work:.4f}"
+    return Line([what, "in the time measured", *figures], {"stopwatch-5ms": beyond / 1e3})
 
 
 @contextmanager

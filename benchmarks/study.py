@@ -203,7 +203,8 @@ def size_lines(folder: Path, rounds: int, largest: int) -> list[Line]:
         work = study(folder, [trace], ["hold", "kalman"], "--workers", "2")
         cost = in_turn({"": work}, rounds if times == 1 else 1)[""]
         base = cost if times == 1 else base
-        ratios = f"{cost.worker / base.worker:.2f}, {cost.parent / base.parent:.2f} x memory"
+        largest_process = max(cost.worker, cost.parent) / max(base.worker, base.parent)
+        ratios = f"{largest_process:.2f} x memory"
         found.append(line(f"one trace, {123 * times:,} sequences", "hold + kalman", cost, ratios))
         os.unlink(trace)
         times *= 10

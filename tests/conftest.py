@@ -59,6 +59,12 @@ def every_frame() -> Metadata:
     return Metadata.new("30", "every-frame")
 
 
+@pytest.fixture(autouse=True)
+def no_sensors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No profile measures the power of the machine that the tests run on, which takes time."""
+    monkeypatch.setattr("lae_sim.profile.run.find_sensors", tuple)
+
+
 @pytest.fixture(scope="session")
 def torch() -> Any:
     """The torch module on one thread, since several wait for each other on a busy machine."""

@@ -222,6 +222,19 @@ class Staged:
             time.sleep(0.02)
 
 
+class Numbered:
+    """Marks a stage of another name again and again."""
+
+    def init(self, frame: Any, box: Any) -> None:
+        pass
+
+    def track(self, frame: Any) -> Any:
+        for number in range(101):
+            with stage(f"frame_{number}"):
+                pass
+        return BOX
+
+
 class Misnamed:
     """Marks a stage that no trace can name."""
 

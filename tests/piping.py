@@ -129,6 +129,9 @@ class Witness:
             self.hand_on(place, frame)
             return True
         for place, state in enumerate(self.states):
+            first = state.passages[0]
+            if place == self.piped.tracker and first.taken != NOT_YET and first.finished == NOT_YET:
+                continue
             if state.idle and state.waiting and not self.is_over(place, state.waiting[0]):
                 self.take(place, state)
                 return True

@@ -76,8 +76,8 @@ class Patient:
     def __call__(self, clock, calls):
         return patient(clock, calls, self.frames)
 
-def times(recording, ms=1):
-    return lambda frame: ms * 1_000_000
+def times(recording, ms=1, more=0):
+    return lambda frame: (ms + more) * 1_000_000
 
 def timeless():
     pass
@@ -144,6 +144,7 @@ def test_policies_latencies_and_trackers_take_parameters():
     assert parse_policy("mine:patient:frames=3").scores_latency is False
     recording = next(iter(lae_sim.read_trace(SLOW)))
     assert parse_latency("mine:times:ms=47,init=9ns")(recording)(1) == 47_000_000
+    assert parse_latency("mine:times:ms=47,more=1,init=9ns")(recording)(1) == 48_000_000
     with InProcess("mine:Tracker:reach=4", {}) as tracker:
         frame = np.zeros((8, 8, 3), np.uint8)
         tracker.init(frame, (0, 0, 1, 1))

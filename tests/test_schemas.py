@@ -15,7 +15,7 @@ from fakes import bright_frame
 from jsonschema import Draft202012Validator, ValidationError
 from places import TRACES
 from restarted import gap_pass
-from schemas import check, schemas
+from schemas import check, closed, schemas
 
 from lae_sim.trace.file import read_trace
 
@@ -76,8 +76,11 @@ def test_compare() -> None:
 
 
 def test_show(gaps: Path) -> None:
-    staged = TRACES / "cases" / "valid" / "stages.parquet"
-    *_, of_stages, last = printed("show", SLOW, REAL_TIME, staged, gaps)["traces"]
+    staged, full = (
+        TRACES / "cases" / "valid" / f"{n}.parquet" for n in ("stages", "full-metadata")
+    )
+    measured, *_, of_stages, last = printed("show", full, SLOW, REAL_TIME, staged, gaps)["traces"]
+    assert measured["provenance"]["device"]["energy"]["joules_per_frame"] == 0.19
     assert [row["stage"] for row in of_stages["times"]["stages"]] == ["decode", "inference", None]
     assert last["reach"]["bins"]
 
@@ -106,6 +109,19 @@ def test_fidelity(gaps: Path, tmp_path: Path) -> None:
     again.write_bytes(REAL_TIME.read_bytes())
     loops = ("--closed-loop", REAL_TIME, again)
     assert printed("fidelity", SLOW, *loops, "--strided", gaps)["repeats"]
+
+
+def test_a_log(tmp_path: Path) -> None:
+    text = "frame,captured_ms,arrived_ms,started_ms,ready_ms,x,y,w,h\n"
+    text += "0,0,5,6,40,1,2,3,4\n1,33,39,,,,,,\n2,66,72,74,99,,,,\n"
+    (tmp_path / "flight.csv").write_text(text)
+    trace = tmp_path / "t.parquet"
+    assert printed("convert", tmp_path / "flight.csv", "--out", trace)["held"] == {"flight": 1}
+    Draft202012Validator(closed(METADATA)).validate(read_trace(trace).metadata.document)
+    (replayed,) = printed("replay", trace, "--policy", "recorded")["traces"]
+    assert replayed["exact"]
+    (shown,) = printed("show", trace)["traces"]
+    assert [row["stage"] for row in shown["times"]["stages"]] == ["queue", "tracker", None]
 
 
 @pytest.mark.parametrize("command", ["convert", "profile"])

@@ -28,7 +28,10 @@ TYPES: Types = {
     "score": pa.float32(),
     "arrival_ns": pa.int64(),
     "visible": pa.bool_(),
-    **{f"stage_{name}_ns": pa.int64() for name in ("decode", "inference", "warp_2")},
+    **{
+        f"stage_{name}_ns": pa.int64()
+        for name in ("decode", "inference", "warp_2", "queue", "tracker")
+    },
 }
 DOCUMENT: Document = {
     "format": "lae-trace",
@@ -38,6 +41,22 @@ DOCUMENT: Document = {
 }
 
 NEWER: Document = {**DOCUMENT, "version": "1.1"}
+LOGGED: Document = {
+    **NEWER,
+    "schedule": {"kind": "real-time", "policy": "recorded"},
+    "timing": {"source": "measured", "clock": "receive times of the bag"},
+    "log": {
+        "format": "ros",
+        "images": "/camera/image",
+        "boxes": "/tracker/box",
+        "matched_by": "equal stamps",
+        "arrivals": "received",
+        "clock_offset_ns": -12_000_000,
+        "clock_offset_source": "estimated",
+        "camera_delay_ns": {"least": 0, "median": 1_000_000, "most": 9_000_000},
+        "initial_box": "first output",
+    },
+}
 RESTARTS: Document = {**NEWER, "schedule": {"kind": "restarts"}}
 
 
@@ -133,6 +152,19 @@ def staged(columns: Columns, *changes: tuple[int, Any]) -> Columns:
     }}  # fmt: skip
 
 
+def logged() -> Columns:
+    """A real-time run whose frames queued: what waiting and the calls took."""
+    columns = skipping()
+    # of ``a`` a call began before the last had ended
+    waited = [0, None, 4_000_000, None, 0, None, 0, 0]
+    calls = [
+        None if ns is None or wait is None else ns - wait
+        for ns, wait in zip(columns["elapsed_ns"], waited)
+    ]
+    stages = {"stage_queue_ns": waited, "stage_tracker_ns": calls}
+    return {**columns, "arrival_ns": arriving()["arrival_ns"], **stages}
+
+
 def no_truth() -> Columns:
     """Truth that is missing in two frames."""
     columns = good()
@@ -161,10 +193,40 @@ def write_valid(folder: Path) -> None:
             "settings": {"scale": 2},
             "search": {"half_side": 1.25, "window": True, "source": "crops of 128 and 256 pixels"},
         },
-        "device": {"model": "board", "power_mode": "15W"},
+        "device": {
+            "model": "board",
+            "power_mode": "15W",
+            "energy": {
+                "calls": 4,
+                "seconds": 0.08,
+                "power_w": {"VDD_IN": 9.5, "VDD_SOC": 1.25},
+                "idle_w": {"VDD_IN": 5.0, "VDD_SOC": 1.0},
+                "total": ["VDD_IN"],
+                "joules_per_frame": 0.19,
+                "joules_per_frame_above_idle": 0.09,
+            },
+            "clocks": {"cpu_mhz": 1728.0, "gpu_mhz": 918.0},
+            "slowdowns": {"software power cap": 0.25},
+            "unread": {"VDD_SOC": 0.1},
+            "beside": [
+                {
+                    "command": "./encode.sh",
+                    "exit": 1,
+                    "seconds": 2.5,
+                    "sequences": 1,
+                    "of_sequences": 2,
+                }
+            ],
+        },
         "timing": {"source": "measured", "clock": "perf_counter_ns", "warmup_calls": 3},
         "dataset": {"name": "example"},
-        "sequences": {"a": {"image_size": [640, 480], "attributes": ["Occlusion"]}},
+        "sequences": {
+            "a": {
+                "image_size": [640, 480],
+                "attributes": ["Occlusion"],
+                "sampled": {"calls": 2, "seconds": 0.04, "power_w": {"VDD_IN": 9.5}},
+            }
+        },
         "a key of the future": [1, {"x": None}],
     }
     dictionary = pa.dictionary(pa.int32(), pa.string())
@@ -183,6 +245,7 @@ def write_valid(folder: Path) -> None:
     write(folder / "stages-of-a-real-time-run.parquet", staged(skipping()), newer_real_time)
     own = {**good(), "stage_warp_2_ns": [None] * 4 + [0, 5, 6, 7]}
     write(folder / "stage-of-ones-own.parquet", own, NEWER)
+    write(folder / "log.parquet", logged(), LOGGED)
     write(folder / "all-of-1.1.parquet",
           staged({**flagged(True, True, True, False), **arriving()}), NEWER)  # fmt: skip
     write(folder / "zero-time.parquet", mapped(lambda _: 0, "elapsed_ns"))

@@ -1,4 +1,4 @@
-"""``lae-sim convert``: traces from results that other toolkits have written."""
+"""``lae-sim convert``: traces from results of other toolkits, and from logs of running trackers."""
 
 from __future__ import annotations
 
@@ -23,8 +23,22 @@ from lae_sim.progress import ProgressBar, print_text
 
 if TYPE_CHECKING:
     from lae_sim.importers.convert import ConversionSummary
+    from lae_sim.trace.file import Trace
 
-_FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "json", "npz", "lae-pvt")
+_FORMATS = ("auto", "got10k", "pytracking", "ope", "mat", "json", "npz", "lae-pvt", "ros", "csv")
+_RESULTS_ONLY = (
+    "time_unit",
+    "repetition",
+    "time",
+    "sequence",
+    "exclude",
+    "truth_file",
+    "frame_times",
+)
+_LOGS_ONLY = (
+    "image_topic", "box_topic", "truth_topic", "field", "target", "match", "clock_offset",
+    "arrivals", "gaps", "init_box",
+)  # fmt: skip
 _EXAMPLES = f"""\
 formats (auto tells them apart):
   got10k       <seq>.txt with <seq>_time.txt or times/<seq>_time.txt (s);
@@ -35,6 +49,9 @@ formats (auto tells them apart):
   json         <seq>.json with res and fps (jwlim's tracker_benchmark)
   npz          one file, an array [frames, 4] per sequence: needs --time
   lae-pvt      <seq>.pkl of LAE-PVT and PVT++, recorded in real time
+  ros          a log: a bag of ROS 2 (folder, .mcap, .db3) or ROS 1 ({install("ros")})
+  csv          a log with a row a frame: frame, arrived_ms, ready_ms, x, y, w, h; perhaps
+               captured_ms, started_ms, score, truth_x, ...; times in _s, _ms, _us or _ns
 Names may be <dataset>_<seq> (nfs_, uav_, ...), <seq>_<tracker> and <tracker>_<seq> in any format;
 of several trackers in a folder --tracker chooses one. A .mat of version 7.3 needs h5py
 ({install("mat73")}).
@@ -45,6 +62,10 @@ examples:
   lae-sim convert results/ECO --truth UAV123_10fps --fps 10 --time mean-fps:13.5 --out eco.parquet
   lae-sim convert results_rt_raw/siamrpn --truth UAVDT --device 'AGX Xavier' --out rt.parquet
   lae-sim convert results/kcf --truth OTB100 --truth-file Tiger1=Tiger1_354.txt --out kcf.parquet
+  lae-sim convert flight/ --out flight.parquet
+  lae-sim convert flight.mcap --box-topic /track --field x=roi.x_offset --field y=roi.y_offset
+      --field w=roi.width --field h=roi.height --out flight.parquet
+  lae-sim convert flight.csv --fps 30 --out flight.parquet
   lae-sim convert results/OPE_OTB --tracker ECO-HC --truth OTB100 --out eco-hc.parquet
 """
 
@@ -53,18 +74,35 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = new_parser(
         "lae-sim convert",
-        "Make a trace from a tracker's results and the dataset's ground truth.",
+        "Make a trace from a tracker's results and the dataset's ground truth, or from the log of\n"
+        "a tracker that ran: a ROS bag, or a table.",
         _EXAMPLES,
     )
     add = made.add_argument
-    add("results", type=Path, metavar="RESULTS", help="folder of one tracker's results, or a file")
-    add("--truth", type=Path, required=True, metavar="ROOT", help="the dataset's folder")
+    add(
+        "results",
+        type=Path,
+        metavar="RESULTS",
+        help="folder of one tracker's results, or a file; or a log: a bag, a .csv",
+    )
+    add(
+        "--truth",
+        type=Path,
+        metavar="ROOT",
+        help="the dataset's folder; of a log, if there is one, a file with a row for each frame",
+    )
     add("--out", type=Path, required=True, metavar="TRACE", help="the trace to write (.parquet)")
-    add("--format", choices=_FORMATS, default="auto", help="format of RESULTS (default: auto)")
+    add(
+        "--format",
+        choices=_FORMATS,
+        default="auto",
+        metavar="FORMAT",
+        help="format of RESULTS, of those below (default: auto)",
+    )
     add(
         "--fps",
         help="world frames per second, such as 29.97 or 30000/1001 (default: 30, or 10 if the "
-        "dataset's name says 10fps); of NfS, the set: 30 or 240",
+        "dataset's name says 10fps); of NfS, the set: 30 or 240; of a log by default estimated",
     )
     add(
         "--time",
@@ -97,12 +135,66 @@ def parser() -> argparse.ArgumentParser:
         metavar="SEQ=FILE",
         help="other ground truth for one sequence",
     )
-    add("--skip-missing", action="store_true", help="leave out results without ground truth")
+    add(
+        "--skip-missing",
+        action="store_true",
+        help="leave out results without ground truth, and boxes of a log that belong to no frame",
+    )
     add_frame_times(add)
     add("--image-size", type=argument(_size), metavar="WxH", help="image size, such as 1280x720")
     add_force(add)
     add("--json", action="store_true", help="print the summary as JSON")
+    _add_logs(made)
     return made
+
+
+def _add_logs(made: argparse.ArgumentParser) -> None:
+    """Add what is asked of logs only."""
+    add = made.add_argument_group("logs").add_argument
+    add("--image-topic", metavar="TOPIC", help="of a bag: the frames (default: the one of images)")
+    add("--box-topic", metavar="TOPIC", help="of a bag: the outputs (default: the one of boxes)")
+    add("--truth-topic", metavar="TOPIC", help="of a bag: boxes of ground truth")
+    add(
+        "--field",
+        action="append",
+        default=[],
+        type=argument(_field),
+        metavar="NAME=PATH",
+        help="of a bag: where a message of any type has its box: x, y, w, h, or cx, cy for its "
+        "centre, or x2, y2 for its other corner; perhaps score, stamp, started, ready",
+    )
+    add("--target", metavar="ID", help="of a bag: one of several targets (default: the best score)")
+    add(
+        "--match",
+        metavar="TIME",
+        help="of a bag: a box is of the nearest earlier frame, within this time, such as 20ms "
+        "(default: of the frame of the same stamp)",
+    )
+    add(
+        "--clock-offset",
+        metavar="TIME",
+        help="what to add to capture times to have the log's clock: --clock-offset=-3600s, or "
+        "estimate, from the least delay (default: the clocks are one)",
+    )
+    add(
+        "--arrivals",
+        choices=("received", "captured"),
+        help="when frames arrive: when the log received them (default, where it says so), or when "
+        "they were captured",
+    )
+    add(
+        "--gaps",
+        choices=("dropped", "skipped"),
+        help="of a table whose frame numbers jump: frames that the camera never sent, or that came "
+        "and the log left out (default: refused)",
+    )
+    add(
+        "--init-box",
+        type=argument(_init_box),
+        metavar="X,Y,W,H",
+        help="the box that the tracker was given on the log's first frame (default: the first "
+        "output's, on its frame)",
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -117,16 +209,37 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _convert(arguments: argparse.Namespace) -> None:
-    from lae_sim.importers.convert import convert_results
+    from lae_sim.importers.measured import log_format
     from lae_sim.trace.file import check_replaces, trace_at, write_trace
 
     check_places([arguments.out])
-    truth_files = dict(arguments.truth_file)
     # of a folder those files count that are read (below), and no file is replaced but a trace
-    read = (arguments.results, arguments.truth, *truth_files.values())
+    read = [arguments.results, *dict(arguments.truth_file).values()]
+    read += [arguments.truth] if arguments.truth is not None else []
     check_distinct([arguments.out], [path for path in read if path.is_file()])
+    is_log = log_format(arguments.results, arguments.format) is not None
+    trace, summary = (_read_log if is_log else _read_results)(arguments)
+    check_distinct([arguments.out], summary.files)
+    if not arguments.force:
+        check_replaces(arguments.out, summary.tracker, summary.dataset)
+    elif trace_at(arguments.out) is None:  # and none of the dataset's files, read or not
+        check_distinct([arguments.out], read)
+    write_trace(trace, arguments.out)
+    if arguments.json:
+        print_json(summary.document(arguments.out))
+    else:
+        next_step = f"Next: lae-sim replay {arguments.out}{' --policy recorded' if is_log else ''}"
+        print_text("\n".join([*lines_of(summary, arguments.out), next_step]))
+
+
+def _read_results(arguments: argparse.Namespace) -> tuple[Trace, ConversionSummary]:
+    from lae_sim.importers.convert import convert_results
+
+    _check_not_given(arguments, _LOGS_ONLY, "is of logs, and these are results")
+    if arguments.truth is None:
+        raise LaeError("--truth: results need the dataset's folder")
     with closing(ProgressBar("convert", "sequences")) as bar:
-        trace, summary = convert_results(
+        return convert_results(
             arguments.results,
             arguments.truth,
             format=arguments.format,
@@ -139,23 +252,47 @@ def _convert(arguments: argparse.Namespace) -> None:
             dataset=arguments.dataset,
             sequences=arguments.sequence,
             exclude=arguments.exclude,
-            truth_files=truth_files,
+            truth_files=dict(arguments.truth_file),
             skip_missing=arguments.skip_missing,
             image_size=arguments.image_size,
             frame_times=arguments.frame_times,
             progress=bar,
         )
-    check_distinct([arguments.out], summary.files)
-    if not arguments.force:
-        check_replaces(arguments.out, summary.tracker, summary.dataset)
-    elif trace_at(arguments.out) is None:  # and none of the dataset's files, read or not
-        check_distinct([arguments.out], (arguments.results, arguments.truth))
-    write_trace(trace, arguments.out)
-    if arguments.json:
-        print_json(summary.document(arguments.out))
-    else:
-        next_step = f"Next: lae-sim replay {arguments.out}"
-        print_text("\n".join([*lines_of(summary, arguments.out), next_step]))
+
+
+def _read_log(arguments: argparse.Namespace) -> tuple[Trace, ConversionSummary]:
+    from lae_sim.importers.measured import convert_log
+
+    _check_not_given(arguments, _RESULTS_ONLY, "is of results, and this is a log")
+    return convert_log(
+        arguments.results,
+        format=arguments.format,
+        truth=arguments.truth,
+        fps=arguments.fps,
+        init_box=arguments.init_box,
+        arrivals=arguments.arrivals,
+        clock_offset=arguments.clock_offset,
+        image_topic=arguments.image_topic,
+        box_topic=arguments.box_topic,
+        truth_topic=arguments.truth_topic,
+        fields=dict(arguments.field),
+        target=arguments.target,
+        match=arguments.match,
+        gaps=arguments.gaps,
+        skip_missing=arguments.skip_missing,
+        tracker=arguments.tracker,
+        device=arguments.device,
+        dataset=arguments.dataset,
+        image_size=arguments.image_size,
+    )
+
+
+def _check_not_given(arguments: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """Refuse options that mean nothing here."""
+    defaults = parser()
+    for name in names:
+        if getattr(arguments, name) != defaults.get_default(name):
+            raise LaeError(f"--{name.replace('_', '-')} {why}")
 
 
 def lines_of(summary: ConversionSummary, out: Path) -> list[str]:
@@ -209,6 +346,23 @@ def _truth_file(text: str) -> tuple[str, Path]:
     if not (name and equals and path):
         raise LaeError(f"{text!r} is not SEQ=FILE")
     return name, Path(path)
+
+
+def _field(text: str) -> tuple[str, str]:
+    name, equals, path = text.partition("=")
+    if not (name and equals and path):
+        raise LaeError(f"{text!r} is not NAME=PATH, such as x=bbox.center.position.x")
+    return name, path
+
+
+def _init_box(text: str) -> tuple[float, float, float, float]:
+    from lae_sim.datasets.numbers import NUMBER
+
+    sides = [side.strip() for side in text.split(",")]
+    if len(sides) != 4 or not all(map(NUMBER.match, sides)):
+        raise LaeError(f"{text!r} is not a box: write X,Y,W,H")
+    x, y, w, h = map(float, sides)
+    return x, y, w, h
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -33,6 +33,7 @@ EXTRAS = {
     "film": "av",
     "trax": "vot-trax",
     "mat73": "h5py",
+    "ros": "rosbags",
     "remote": "fsspec",
     "distributed": "distributed",
     "notebook": "nbclient",

@@ -35,9 +35,11 @@ examples:
   lae-sim profile --dataset DTB70 --root ~/data/DTB70 --stride 3/2 2 3
   lae-sim profile --tracker nanotrack --option weights=nanotrackv3 --root ~/data/DTB70
   lae-sim profile --tracker my_package.my_module:MyTracker --option size=small --device cuda:0
+  lae-sim profile --tracker vot:NCC --ini workspace/trackers.ini --root ~/data/DTB70
   lae-sim profile --mode real-time --pre-forecaster kalman --timing jetson.parquet
   lae-sim profile --closed-loop constant:47ms constant:100ms --stride 3/2 2 3  then lae-sim fidelity
   lae-sim profile --gaps 10m --stride 2                how far it finds a target from where it was
+  lae-sim profile --root ~/data/DTB70 --beside './encode.sh'    beside the load that it will have
   lae-sim profile --closed-loop constant:47ms,init=1s --stride 3/2 2 3         then lae-sim fidelity
 
 trackers:
@@ -48,6 +50,7 @@ trackers:
   pysot                   SiamRPN++, SiamMask: --option checkout= config= snapshot=
   pytracking              ATOM, DiMP, PrDiMP: --option checkout= tracker= parameter= network=
   trax:COMMAND            any program that speaks TraX
+  vot:NAME                what the VOT toolkit's trackers.ini names (--ini PATH)
   package.module:factory  your own: an object with init(frame, box) and track(frame)
 """
 
@@ -72,6 +75,7 @@ def parser() -> argparse.ArgumentParser:
         help="options of the tracker",
     )
     add("--device", help="the option device: cpu, cuda:0")
+    add("--ini", metavar="PATH", help="registry of vot:NAME (default: trackers.ini)")
     add("--trust-checkpoint", action="store_true", help="let pytracking unpickle its checkpoint")
     add("--translate", action="store_true", help="set the search by shifting the frame")
     add("--python", metavar="PATH", help="interpreter of the worker process (3.8 or newer)")
@@ -85,9 +89,8 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--frame-timeout",
         type=argument(parse_duration),
-        default=30_000_000_000,
         metavar="TIME",
-        help="give a sequence up when a call takes longer (default: 30s)",
+        help="give a sequence up when a call takes longer (default: 30s or the registry's)",
     )
     add(
         "--warmup",
@@ -168,6 +171,23 @@ def parser() -> argparse.ArgumentParser:
         help="repeat the first pass (default: 1)",
     )
     add("--include-decode", action="store_true", help="count the decoding of frames")
+    add(
+        "--beside",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="COMMAND",
+        help="run these shell commands as long as anything is measured, such as the video encoder "
+        "that shares the device; they are ended then",
+    )
+    add(
+        "--idle",
+        type=argument(parse_duration),
+        default=2_000_000_000,
+        metavar="TIME",
+        help="measure the power at rest so long before the tracker starts, where there are sensors "
+        "(default: 2s)",
+    )
     group = made.add_argument_group("output")
     add = group.add_argument
     add("--out", metavar="TRACE", help="the trace (default: TRACKER-DATASET.parquet)")
@@ -196,6 +216,8 @@ def _profile(arguments: argparse.Namespace, failed: list[Any]) -> None:
     options = parse_options(dict(arguments.option))
     if arguments.device is not None:
         options["device"] = arguments.device
+    if arguments.ini is not None:
+        options["ini"] = arguments.ini
     if arguments.trust_checkpoint:
         options["trust_checkpoint"] = True
     plan = ProfilePlan(
@@ -224,6 +246,8 @@ def _profile(arguments: argparse.Namespace, failed: list[Any]) -> None:
         gaps=BUDGET_NS if arguments.gaps is True else arguments.gaps,
         repeat=arguments.repeat,
         include_decode=arguments.include_decode,
+        beside=tuple(arguments.beside),
+        idle=arguments.idle,
     )
     with closing(ProgressBar(arguments.tracker, "frames")) as bar:
 

@@ -58,6 +58,7 @@ policies, by which a free tracker takes a frame:
   shrinking-tail:TIME     the newest, or the next if a call of that time, such as 47ms, then ends
                           closer after an arrival (Li et al. 2020)
   vot-realtime[:GRACE]    the VOT toolkit's rule: it skips frames, but never scores latency
+  recorded                the frames that the trace holds, in order: a measured log as it was
   package.module:object   your own
 latencies, each perhaps with ,init=TIME for the initialisation (constant:47ms,init=800ms):
   recorded                each frame's recorded time

@@ -135,7 +135,8 @@ def split_init(text: str, path: bool = False) -> tuple[str, int | None]:
 
     Args:
         text: the name, which may end in ``,init=TIME``: what the initialisation takes.
-        path: whether the name is that of a file, which may hold commas of its own.
+        path: whether the name is that of a file, which may hold commas of its own; the parameters
+            of a plug-in do anyway.
 
     Returns:
         The name alone, and the time of the initialisation, ns; None if it is not named.
@@ -146,7 +147,8 @@ def split_init(text: str, path: bool = False) -> tuple[str, int | None]:
     name, _, value = text.rpartition(",init=") if ",init=" in text else (text, "", None)
     if ",init=" in name:
         raise LaeError(f"{text!r}: init stands twice")
-    if "," in name and not path:
+    options = name.partition(",")[0].count(":") > 1  # as module:object:a=1,b=2 has
+    if "," in name and not path and not options:
         rest = name.partition(",")[2]
         raise LaeError(f"{text!r}: no {rest!r} here: after a comma comes init=TIME, as init=800ms")
     if value is None:

@@ -44,7 +44,7 @@ class Camera:
             with that probability, by a seed), or their numbers.
 
     Raises:
-        LaeError: if a duration is none.
+        LaeError: if a duration is none, or the drops are neither text nor a list.
 
     Example:
         >>> import lae_sim
@@ -63,6 +63,11 @@ class Camera:
         for key in ("exposure", "delivery"):
             _named(f"camera: {key}", parse_duration, getattr(self, key))
         if not isinstance(self.drops, str):
+            if not isinstance(self.drops, Sequence):
+                raise LaeError(
+                    f"camera: drops: 'every:10', 'share:0.05:1' or a list of frames, not "
+                    f"{shown(self.drops)}"
+                )
             object.__setattr__(self, "drops", tuple(self.drops))
 
     @property
@@ -79,7 +84,8 @@ class Stage:
         name: of small letters, digits and ``_``.
         time: where its times come from: a duration such as ``"6ms"``, the name of a latency such as
             ``"lognormal:1"``, or a function of the recording. By default the tracker has the
-            world's latency, and another stage the times that the trace has recorded for it.
+            world's latency (of recorded times, what is left to it beside the pipeline's other
+            stages), and another stage the times that the trace has recorded for it.
         workers: frames that it works on at once.
         queue: frames that may wait, besides those being worked on; None for any number.
         when_full: what is done with a frame that comes when so many wait: ``"drop-oldest"`` and
@@ -132,6 +138,10 @@ class Stage:
                 least_one = "a whole number" if least is None else f"a whole number from {least}"
                 more = ", or None for any number of frames" if key == "queue" else ""
                 raise LaeError(f"{where}: {key}: {shown(value)} is not {least_one}{more}")
+        for key in ("resource", "after"):
+            value = getattr(self, key)
+            if value is not None and (not isinstance(value, str) or not value):
+                raise LaeError(f"{where}: {key}: a name, not {shown(value)}")
         if self.when_full not in WHEN_FULL:
             raise LaeError(
                 f"{where}: when_full: no {shown(self.when_full)}: there are "
@@ -174,17 +184,23 @@ class Pipeline:
     name: str = "pipeline"
 
     def __post_init__(self) -> None:
-        if not all(isinstance(stage, Stage) for stage in self.stages):
+        stages = tuple(self.stages) if isinstance(self.stages, Iterable) else (self.stages,)
+        if not all(isinstance(stage, Stage) for stage in stages):
             raise LaeError("stages: a pipeline has stages, such as Stage('decode', '6ms')")
         if not isinstance(self.camera, Camera):
             raise LaeError(f"camera: such as Camera(delivery='8ms'), not {shown(self.camera)}")
-        object.__setattr__(self, "stages", _in_order(self.stages))
+        object.__setattr__(self, "stages", _in_order(stages))
+        if not isinstance(self.name, str) or not self.name or not self.name.isprintable():
+            raise LaeError(f"name: {shown(self.name)} is no name of a pipeline: text in one line")
         names = [stage.name for stage in self.stages]
         if self.tracker not in names:
             raise LaeError(
-                f"no stage is called {self.tracker!r}: there are {listed(names) or 'none'}; "
+                f"no stage is called {shown(self.tracker)}: there are {listed(names) or 'none'}; "
                 "the key tracker says which of them is the tracker"
             )
+        if not isinstance(self.resources, Mapping):
+            raise LaeError(f"resources: whole numbers by name, not {shown(self.resources)}")
+        object.__setattr__(self, "resources", dict(self.resources))
         for name, capacity in self.resources.items():
             counted = isinstance(capacity, Integral) and not isinstance(capacity, bool)
             if not counted or capacity < 1:
@@ -256,8 +272,8 @@ def _in_order(stages: Iterable[Stage]) -> tuple[Stage, ...]:
         ready = [stage for stage in rest.values() if stage.after in (CAMERA, *ordered)]
         if not ready:
             raise LaeError(
-                f"stage {next(iter(rest))!r}: after: a loop: {listed(rest)} come after each other, "
-                "and none after the camera"
+                f"stage {next(iter(rest))!r}: after: a loop: none of {listed(rest)} comes after "
+                "the camera, or after what does"
             )
         ordered[ready[0].name] = rest.pop(ready[0].name)
     return tuple(ordered.values())

@@ -11,9 +11,10 @@ What happens at one tick happens in this order, whatever was scheduled first:
 
 Whenever a step lets an earlier one happen, as a stage of 0 ns does, that one is next. A queue holds
 frames by number, the oldest is taken first. Frame 0 is the tracker's initialisation: no queue drops
-it, the tracker drops frames that come before it, and nothing of it is passed on, since the initial
-box is known from time 0. The tracker drops a frame that is older than its last one. From the end of
-the stream on, no stage but those after the tracker begins a frame; what it has begun goes its way.
+it, the tracker drops frames that come before it, none of its workers takes another meanwhile, and
+nothing of it is passed on, since the initial box is known from time 0. The tracker drops a frame
+that is older than its last one. From the end of the stream on, no stage but those after the tracker
+begins a frame; what it has begun goes its way.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from lae_sim._arrays import Ints
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.pipeline import CAMERA, Pipeline, Stage
 from lae_sim.engine.scheduler import NEVER, Schedule, Service
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, described
 
 Process: TypeAlias = "Generator[simpy.Event, Any, None]"
 
@@ -114,9 +115,9 @@ def simulate_pipeline(
         lost: frames that the camera does not deliver; frame 0 always is.
 
     Raises:
-        LaeError: if the sequence is empty, or a time negative, or an instant does not fit in 64-bit
-            ticks; it names the stage and the frame.
-        TypeError: if a time is not an integer, such as seconds as a float.
+        LaeError: if the sequence is empty, a time is negative or no integer, such as seconds as a
+            float, a service raises something, or an instant does not fit in 64-bit ticks; it names
+            the stage and the frame.
 
     Example:
         >>> from lae_sim.engine import Clock, Pipeline, Stage, simulate_pipeline
@@ -143,7 +144,7 @@ def simulate_pipeline(
             length,
             clock.ticks_per_ns,
             services[stage.name],
-            resources.get(stage.resource or ""),
+            None if stage.resource is None else resources[stage.resource],
             takes=_TAKES + place,
             asks=_TAKES + len(pipeline.stages) * (1 + urgencies.index(stage.priority)) + place,
             returns=_TAKES + len(pipeline.stages) * (1 + len(urgencies)),
@@ -152,7 +153,7 @@ def simulate_pipeline(
         )
     for name, each in work.items():
         each.following = [work[stage.name] for stage in pipeline.after(name)]
-        for _ in range(each.stage.workers):
+        for _ in range(min(each.stage.workers, length)):  # more would never get a frame
             environment.process(each.worker())
     first = [work[stage.name] for stage in pipeline.after(CAMERA)]
     delivered: list[float] = [-1] * length
@@ -304,7 +305,8 @@ class _Work:
 
     def _let_take(self) -> None:
         """Give a worker its turn at this tick, if one is idle and a frame waits."""
-        if self.idle and self.waiting and not self.has_turn:
+        initialises = self.is_tracker and self.taken[0] >= 0 and self.finished[0] < 0
+        if self.idle and self.waiting and not self.has_turn and not initialises:
             self.has_turn = True
             _Turn(self.environment, self.takes).callbacks.append(self._take)
 
@@ -388,9 +390,14 @@ def _time(what: str, service: Callable[[int], int], frame: int) -> int:
     """What a frame takes, ns.
 
     Raises:
-        LaeError: if it is negative.
+        LaeError: if it is negative or no integer, or the service raises something.
     """
-    ns = index(service(frame))
+    try:
+        ns = index(service(frame))
+    except LaeError:
+        raise
+    except Exception as error:  # SimPy would raise a copy, which does not tell where it was
+        raise LaeError(f"{what}, frame {frame}: {described(error)}") from error
     if ns < 0:
         raise LaeError(f"{what}, frame {frame}: a time cannot be negative ({ns} ns)")
     return ns

@@ -11,7 +11,7 @@ from lae_sim.errors import LaeError
 
 SKIPPED = (
     "the trace has no time for it, since the tracker skipped it; use the times by call, or a trace "
-    "of every frame"
+    "of every frame, or the policy that it was recorded under"
 )
 
 

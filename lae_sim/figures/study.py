@@ -261,13 +261,48 @@ def _sweep_panels(
         yield Panel(title, SWEEPS[key], name, drawn, logarithmic)
 
 
-def front(view: View) -> Picture | None:
-    """AUC against the time of a call, and the Pareto front of each dataset and forecaster."""
-    points = _points(view)
+@dataclass(frozen=True)
+class Cost:
+    """What a score is set against.
+
+    Attributes:
+        name: of pictures of it.
+        label: what an axis is called.
+        meaning: the same in a sentence.
+        of: of a row of the summary; None if it is not known.
+        is_best: whether no other row is better and costs less.
+    """
+
+    name: str
+    label: str
+    meaning: str
+    of: Callable[[SummaryRow], float | None]
+    is_best: Callable[[SummaryRow], bool]
+
+
+TIME = Cost(
+    "front",
+    "mean time of a call (ms)",
+    "the mean time of a call",
+    lambda row: row.elapsed_ms,
+    lambda row: row.pareto,
+)
+ENERGY = Cost(
+    "energy",
+    "energy of a call (J)",
+    "the energy of the device during a call",
+    lambda row: None if row.energy is None else row.energy.joules_per_frame,
+    lambda row: row.energy is not None and row.energy.pareto,
+)
+
+
+def front(view: View, cost: Cost = TIME) -> Picture | None:
+    """AUC against what a call costs, and the Pareto front of each dataset and forecaster."""
+    points = _points(view, cost)
     if not points:
         return None
-    fronts = _fronts(view, points)
-    caption = f"{_front_caption(points)}{_left_out(view, points)}{_grey(fronts)}"
+    fronts = _fronts(view, points, cost)
+    caption = f"{_front_caption(points, cost)}{_left_out(view, points)}{_grey(fronts)}"
     return Picture(caption, partial(_draw_fronts, fronts))
 
 
@@ -285,33 +320,34 @@ def _left_out(view: View, points: Sequence[Point]) -> str:
     return _of_datasets(view) + said
 
 
-def _points(view: View) -> list[Point]:
+def _points(view: View, cost: Cost = TIME) -> list[Point]:
     """Those of the first datasets: all of the front, and the best of the others."""
     datasets: dict[str, list[Point]] = {}
     for row in view.standing:
-        if row.elapsed_ms is not None and (auc := row.score("auc")) is not None:
-            datasets.setdefault(row.dataset, []).append(Point(row, row.elapsed_ms, auc))
+        x, auc = cost.of(row), row.score("auc")
+        if x is not None and auc is not None:
+            datasets.setdefault(row.dataset, []).append(Point(row, x, auc))
     chosen: list[Point] = []
     for points in (datasets[name] for name in _datasets(view) if name in datasets):
         least = sorted((point.auc for point in points), reverse=True)[:MOST_POINTS][-1]
-        chosen += [point for point in points if point.row.pareto or point.auc >= least]
+        chosen += [point for point in points if cost.is_best(point.row) or point.auc >= least]
     return chosen
 
 
-def _front_caption(points: Sequence[Point]) -> str:
+def _front_caption(points: Sequence[Point], cost: Cost) -> str:
     rows = [point.row for point in points]
     return (
-        f"{score_name('AUC', rows)} against the mean time of a call; hollow: hold; lines join what "
+        f"{score_name('AUC', rows)} against {cost.meaning}; hollow: hold; lines join what "
         f"no other tracker beats in both: {shared_setting(rows)}"
     )
 
 
 @dataclass(frozen=True)
 class Point:
-    """A row of the summary with its time of a call (ms) and its AUC, both known."""
+    """A row of the summary with what a call costs and its AUC, both known."""
 
     row: SummaryRow
-    ms: float
+    cost: float
     auc: float
 
 
@@ -322,7 +358,7 @@ class Mark:
     Attributes:
         run: of its tracker.
         name: of its tracker, if that is named; others are grey.
-        ms, auc: where it is.
+        cost, auc: where it is.
         forecaster: what answers.
         style: colour and mark of the tracker.
         is_best: whether it is on the front.
@@ -330,7 +366,7 @@ class Mark:
 
     run: str
     name: str
-    ms: float
+    cost: float
     auc: float
     forecaster: str
     style: Style
@@ -343,18 +379,20 @@ class Front:
 
     Attributes:
         dataset: its name.
+        xlabel: what the cost is called.
         ylabel: what the AUC is called.
         lines: the kind of line that joins the best marks of each forecaster.
         marks: those of trackers that are named, and of others.
     """
 
     dataset: str
+    xlabel: str
     ylabel: str
     lines: Mapping[str, Any]
     marks: Sequence[Mark]
 
 
-def _fronts(view: View, points: Iterable[Point]) -> list[Front]:
+def _fronts(view: View, points: Iterable[Point], cost: Cost = TIME) -> list[Front]:
     """What is drawn of each dataset."""
     datasets: dict[str, list[Point]] = {}
     for point in points:
@@ -362,8 +400,8 @@ def _fronts(view: View, points: Iterable[Point]) -> list[Front]:
     lines = forecaster_lines(view.forecasters)
     fronts = []
     for dataset, within in datasets.items():
-        best = sorted(within, key=lambda point: (not point.row.pareto, -point.auc))
-        on_front = {run_of(point.row) for point in within if point.row.pareto}
+        best = sorted(within, key=lambda point: (not cost.is_best(point.row), -point.auc))
+        on_front = {run_of(point.row) for point in within if cost.is_best(point.row)}
         runs = list(dict.fromkeys(run_of(point.row) for point in best))
         named = runs[: max(len(on_front), MOST_NAMED)]
         styles = _styles(view, named)
@@ -371,18 +409,18 @@ def _fronts(view: View, points: Iterable[Point]) -> list[Front]:
             Mark(
                 run,
                 _short(view.names[run]) if run in named else "",
-                point.ms,
+                point.cost,
                 point.auc,
                 point.row.forecaster,
                 styles.get((run, "hold"), {"color": GREY, "marker": "."}),
-                point.row.pareto,
+                cost.is_best(point.row),
             )
             for point in within
             for run in [run_of(point.row)]
         ]
         ylabel = score_name("AUC", [point.row for point in within])
         kinds = {name: lines[name] for name in view.forecasters}
-        fronts.append(Front(_short(dataset), ylabel, kinds, marks))
+        fronts.append(Front(_short(dataset), cost.label, ylabel, kinds, marks))
     return fronts
 
 
@@ -401,19 +439,19 @@ def draw_front(axes: Axes, front: Front) -> None:
     """Draw the marks of one dataset, hollow ones of hold, and the front of each forecaster."""
     for forecaster, line in front.lines.items():
         of_it = [mark for mark in front.marks if mark.forecaster == forecaster]
-        best = sorted((mark for mark in of_it if mark.is_best), key=lambda mark: mark.ms)
+        best = sorted((mark for mark in of_it if mark.is_best), key=lambda mark: mark.cost)
         style = {"color": GREY, "linestyle": line, "zorder": 1}
-        xs, ys = [mark.ms for mark in best], [mark.auc for mark in best]
+        xs, ys = [mark.cost for mark in best], [mark.auc for mark in best]
         axes.plot(xs, ys, label=f"front, {_short(forecaster)}", **style)
         shape: Style = {"linestyle": "", "fillstyle": "none" if forecaster == "hold" else "full"}
-        if unnamed := [(mark.ms, mark.auc) for mark in of_it if not mark.name]:
+        if unnamed := [(mark.cost, mark.auc) for mark in of_it if not mark.name]:
             axes.plot(*zip(*unnamed), color=GREY, marker="o", markersize=3.5, alpha=0.6, **shape)
         for mark in of_it:
             if mark.name:
-                axes.plot(mark.ms, mark.auc, **{**mark.style, **shape, "markersize": 7})
+                axes.plot(mark.cost, mark.auc, **{**mark.style, **shape, "markersize": 7})
     axes.margins(x=0.2, y=0.1)
     _name_trackers(axes, front.marks)
-    axes.set(xlabel="mean time of a call (ms)", ylabel=front.ylabel)
+    axes.set(xlabel=front.xlabel, ylabel=front.ylabel)
 
 
 def _name_trackers(axes: Axes, marks: Iterable[Mark]) -> None:
@@ -424,7 +462,7 @@ def _name_trackers(axes: Axes, marks: Iterable[Mark]) -> None:
     letter, line = 0.055 * (right - left) / inches, 0.055 * (high - low)
     taken: list[tuple[float, float, float]] = []
     for mark in sorted(best.values(), key=lambda mark: mark.auc):  # the worst first
-        name, x, y = mark.name, mark.ms, mark.auc
+        name, x, y = mark.name, mark.cost, mark.auc
         is_left = x > (left + right) / 2
         length = letter * (len(name) + 3)
         start, stop = (x - length, x) if is_left else (x, x + length)
@@ -640,15 +678,16 @@ def study_in_columns(view: View) -> Iterator[ColumnFigure]:
             name = f"{panel.ylabel.lower()}-over-{key}-{panel.title}"
             said = f"{panel.ylabel} on {panel.title}. {caption}"
             yield ColumnFigure(name, said, partial(panel_in_column, panel))
-    points = _points(view)
-    for dataset in dict.fromkeys(point.row.dataset for point in points):
-        within = [point for point in points if point.row.dataset == dataset]
-        [drawn] = _fronts(view, within)
-        yield ColumnFigure(
-            f"front-{dataset}",
-            f"{visible(dataset)}: {_front_caption(within)}{_grey([drawn])}",
-            partial(column_figure, partial(draw_front, front=drawn), 2.4),
-        )
+    for cost in (TIME, ENERGY):
+        points = _points(view, cost)
+        for dataset in dict.fromkeys(point.row.dataset for point in points):
+            within = [point for point in points if point.row.dataset == dataset]
+            [drawn] = _fronts(view, within, cost)
+            yield ColumnFigure(
+                f"{cost.name}-{dataset}",
+                f"{visible(dataset)}: {_front_caption(within, cost)}{_grey([drawn])}",
+                partial(column_figure, partial(draw_front, front=drawn), 2.4),
+            )
     caption, rows, runs = _gaining(view)
     height = 0.5 + len(runs) * (0.13 + 0.06 * (len(view.forecasters) - 1))
     if runs:

@@ -1,4 +1,4 @@
-"""Results that other toolkits have written, as recordings of a trace."""
+"""Results that other toolkits have written, and logs of running trackers, as recordings."""
 
 from lae_sim._faces import lazy_face
 

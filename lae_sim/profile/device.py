@@ -113,7 +113,7 @@ def _package(at: Path, name: str) -> str | None:
 
 _CONTROL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f]")  # no trace may hold these
 CPU = "sys/devices/system/cpu"
-_SLOWDOWNS = {
+GPU_SLOWDOWNS = {
     0x04: "software power cap",
     0x08: "hardware slowdown",
     0x20: "software thermal slowdown",
@@ -137,7 +137,7 @@ def readings(root: str | os.PathLike[str] = "/") -> Facts:
     reading = gathered(
         time=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"),
         cpu_mhz=lambda: _cpu_mhz(at),
-        gpu_mhz=lambda: _devfreq_mhz(at),
+        gpu_mhz=lambda: devfreq_mhz(at),
         temperatures_c=lambda: _temperatures(at),
         load=lambda: [float(word) for word in text(at / "proc/loadavg").split()[:3]],
         throttle_events=lambda: _throttle_events(at),
@@ -221,7 +221,7 @@ def _cpu_mhz(at: Path) -> dict[str, float]:
     return {name: max(values) / 1e3 for name, values in khz.items() if any(values)}
 
 
-def _devfreq_mhz(at: Path) -> dict[str, float]:
+def devfreq_mhz(at: Path) -> dict[str, float]:
     """Clocks of an integrated GPU: 17000000.ga10b, 17000000.gpu or gpu-gpc-0 on Jetsons."""
     for device in sorted(at.glob("sys/class/devfreq/*")):
         if re.search(r"gpu|\.g[a-z]\d\db", device.name):
@@ -268,5 +268,5 @@ def _discrete_gpu(at: Path) -> Facts:
     return gathered(  # what it does not know is "[N/A]"
         gpu_mhz=lambda: {"highest": float(clock), "hardware": float(limit)},
         temperatures_c=lambda: {"GPU": float(celsius)},
-        gpu_slowdowns=lambda: [name for bit, name in _SLOWDOWNS.items() if int(mask, 16) & bit],
+        gpu_slowdowns=lambda: [name for bit, name in GPU_SLOWDOWNS.items() if int(mask, 16) & bit],
     )

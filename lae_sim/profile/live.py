@@ -45,6 +45,8 @@ class LiveRun:
         cpu_ns: CPU time of all calls together, ns.
         lost: processed frames where the tracker found nothing, int64 [k].
         image_sizes: width and height of the image of each, pixels, int64 [n, 2].
+        spans_ns: when each call after the initialisation began and ended, by ``perf_counter_ns``,
+            int64 [m, 2]: of a run in phases, more than the processed frames.
     """
 
     recording: Recording
@@ -53,6 +55,7 @@ class LiveRun:
     cpu_ns: int
     lost: Ints
     image_sizes: Ints
+    spans_ns: Ints
 
 
 def run_real_time(
@@ -125,6 +128,7 @@ def run_every_frame(
         cpu_ns=sum(run.cpu_ns for run in runs),
         lost=np.unique(np.concatenate([run.lost for run in runs])),
         image_sizes=sizes,
+        spans_ns=np.concatenate([run.spans_ns for run in runs]),
     )
 
 
@@ -190,18 +194,22 @@ class Live:
         self._answers: list[Answer] = []
         self._elapsed_ns: list[int] = []
         self._stages: list[Mapping[str, int]] = []
+        self._spans_ns: list[tuple[int, int]] = []
 
     def __call__(self, frame: int) -> int:
         """Process a frame; the time it took, ns."""
         before = perf_counter_ns()
         image = self._sequence.read(frame)
-        decoding = perf_counter_ns() - before
+        read = perf_counter_ns()
+        decoding = read - before
         try:
             self._check(frame, image)
             answer = self._init(image) if frame == 0 else self._track(frame, image)
         except LaeError as error:
             name = self._sequence.name
             raise type(error)(f"sequence {name!r}, frame {frame}: {error}") from error
+        if frame:
+            self._spans_ns.append((read, perf_counter_ns()))
         self._answers.append(answer)
         self._progress(frame - self._last)
         self._last = frame
@@ -288,6 +296,7 @@ class Live:
             sum(answer.cpu_ns for answer in self._answers),
             frames[[answer.box is None for answer in self._answers]],
             np.array(self._sizes, np.int64),
+            np.array(self._spans_ns, np.int64).reshape(-1, 2),
         )
 
 

@@ -17,11 +17,16 @@ from lae_sim.engine.arrivals import same_arrivals
 from lae_sim.engine.clock import Clock, parse_duration, split_init
 from lae_sim.engine.scheduler import Service
 from lae_sim.errors import LaeError, TraceError
+from lae_sim.profile.beside import Loads, in_all
 from lae_sim.profile.device import describe_device, readings, source_version
+from lae_sim.profile.energy import of_device, of_sequence
 from lae_sim.profile.journal import Journal
 from lae_sim.profile.live import Live, LiveRun
+from lae_sim.profile.sampler import Sampler
 from lae_sim.profile.timed import TimedTracker, TrackerError
 from lae_sim.replay.latency import by_frame, initialised
+from lae_sim.trace.describe import Facts
+from lae_sim.trace.energy import Energy
 from lae_sim.trace.file import Trace, read_trace, write_trace
 from lae_sim.trace.metadata import FORMAT, ImageSizes, Metadata, version_of
 from lae_sim.trace.recording import Recording, stage_of
@@ -55,6 +60,7 @@ class PassSummary:
         lost: processed frames where the tracker found nothing.
         init_ms: mean time of an initialisation, ms.
         median_ms, p95_ms: of the other calls, ms; None if there are none.
+        joules_per_frame: energy of the device during one of them, J; None if not measured.
     """
 
     trace: str
@@ -67,6 +73,7 @@ class PassSummary:
     init_ms: float
     median_ms: float | None
     p95_ms: float | None
+    joules_per_frame: float | None
 
 
 @dataclass(frozen=True)
@@ -149,7 +156,13 @@ def split_timing(text: str) -> tuple[str, int | None]:
 
 
 def base_document(
-    name: str, tracker: TimedTracker, dataset: str, clock: Clock, warmup: int, includes: str
+    name: str,
+    tracker: TimedTracker,
+    dataset: str,
+    clock: Clock,
+    warmup: int,
+    includes: str,
+    at_rest: Facts,
 ) -> dict[str, Any]:
     """The metadata that all passes of a profile share.
 
@@ -160,6 +173,7 @@ def base_document(
         clock: the world's clock.
         warmup: calls before anything is measured.
         includes: what the times include.
+        at_rest: what was found out about the device before the tracker was started.
     """
     described = dict(tracker.describe())
     measured = {k: described.pop(k) for k in ("synchronised", "threads") if k in described}
@@ -171,7 +185,7 @@ def base_document(
         "format": FORMAT,
         "fps": str(clock.fps),
         "tracker": {"name": name, **described},
-        "device": {**describe_device(), "readings": {"before": readings()}},
+        "device": {**describe_device(), **at_rest, "readings": {"before": readings()}},
         "timing": {
             "clock": "perf_counter_ns",
             "warmup_calls": warmup,
@@ -211,6 +225,8 @@ def run_pass(
     journal: Journal,
     warmup: int,
     progress: Progress,
+    sampler: Sampler | None = None,
+    loads: Loads | None = None,
 ) -> list[Failure]:
     """Run the sequences that the journal lacks, and put each into it.
 
@@ -221,6 +237,8 @@ def run_pass(
         journal: where finished sequences are kept.
         warmup: calls before the first sequence, and after each failure of the tracker.
         progress: told of world frames done.
+        sampler: reads power and clocks meanwhile.
+        loads: what else runs meanwhile.
 
     Returns:
         What failed.
@@ -229,6 +247,7 @@ def run_pass(
         LaeError: if a finished sequence cannot be written.
     """
     failures = []
+    sampler, loads = sampler or Sampler(()), loads or Loads(())
     cold, read_at = True, -math.inf
     for order, sequence in enumerate(dataset.sequences):
         left = task.work(sequence)
@@ -246,6 +265,7 @@ def run_pass(
             if cold:
                 warm_up(tracker, ready, warmup)
                 cold = False
+            sampler.clear()
             made = task.run(ready if task.ahead else sequence, progress=advance)
         except LaeError as error:
             failures.append(Failure(sequence.name, str(error)))
@@ -261,7 +281,11 @@ def run_pass(
             if time.monotonic() - read_at > READING_INTERVAL_S:
                 during = [{"sequence": sequence.name, **readings()}]
                 read_at = time.monotonic()
-            metadata = _of_sequence(task.metadata, sequence, runs, order, during, failed)
+            sampled = {} if task.metadata.kind == "restarts" else of_sequence(sampler, runs[0])
+            around = {"beside": loads.entries()} if loads else {}
+            metadata = _of_sequence(
+                task.metadata, sequence, runs, order, during, failed, sampled, around
+            )
             journal.add(task.name, sequence.name, [run.recording for run in runs], metadata)
         advance(left)
     return failures
@@ -284,9 +308,11 @@ def write_pass(task: Pass, journal: Journal, failures: Sequence[Failure]) -> boo
     before = min(
         (d["device"]["readings"]["before"] for d in kept), key=lambda r: str(r.get("time"))
     )
-    device = dict(document["device"])
+    device = {key: value for key, value in document["device"].items() if key != "energy"}
     device["readings"] = {"before": before, "during": during, "after": readings()}
-    document["device"] = device
+    besides = [d["device"]["beside"] for d in kept if "beside" in d["device"]]
+    beside = {"beside": in_all(besides)} if besides else {}
+    document["device"] = {**device, **of_device(kept), **beside}
     document["schedule"] = {**document["schedule"], **task.schedule(document["sequences"])}
     failed = [*(each for d in kept for each in d.get("failures", ())), *map(asdict, failures)]
     if failed:
@@ -323,7 +349,7 @@ def _with_stages(recording: Recording, marked: Sequence[str]) -> Recording:
 def summary(path: Path) -> PassSummary:
     """What a profiled trace holds, in short."""
     trace = read_trace(path)
-    document = trace.metadata.document
+    document, energy = trace.metadata.document, Energy.of(trace.metadata.document)
     recordings = list(trace)
     calls = np.concatenate([r.elapsed_ns[1:][r.elapsed_ns[1:] >= 0] for r in recordings])
     return PassSummary(
@@ -337,6 +363,7 @@ def summary(path: Path) -> PassSummary:
         init_ms=float(np.mean([r.elapsed_ns[0] for r in recordings])) / 1e6,
         median_ms=float(np.median(calls)) / 1e6 if len(calls) else None,
         p95_ms=float(np.percentile(calls, 95)) / 1e6 if len(calls) else None,
+        joules_per_frame=energy.joules_per_frame if energy else None,
     )
 
 
@@ -360,8 +387,19 @@ def _of_sequence(
     order: int,
     during: list[dict[str, Any]],
     failures: Sequence[Failure],
+    sampled: Facts,
+    around: Facts,
 ) -> Metadata:
-    """The metadata of a pass for one finished sequence."""
+    """The metadata of a pass for one finished sequence.
+
+    Args:
+        metadata: of the pass.
+        sequence, runs, order: what was run, and when.
+        during: readings of the device.
+        failures: of restarts.
+        sampled: what the sensors said, for the entry of the sequence.
+        around: what else ran, for the device.
+    """
     document = dict(metadata.document)
     # of many restarts they would be most of the file
     attributes = () if metadata.kind == "restarts" else sequence.attributes
@@ -373,6 +411,7 @@ def _of_sequence(
             "lost": len(run.lost),
             "measured_ns": int(run.measured_ns.sum()),
             "cpu_ns": run.cpu_ns,
+            **sampled,
         }
         for run in runs
     }
@@ -380,5 +419,5 @@ def _of_sequence(
         document["failures"] = [asdict(failure) for failure in failures]
     device = dict(document["device"])
     device["readings"] = {**device["readings"], "during": during}
-    document["device"] = device
+    document["device"] = {**device, **around}
     return Metadata.of(document)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, fields
 from fractions import Fraction
 from functools import partial
@@ -37,6 +37,8 @@ from lae_sim.files import (
 from lae_sim.forecast.camera import Camera
 from lae_sim.forecast.costs import parse_cost
 from lae_sim.learning.registry import files_named, load_forecaster
+from lae_sim.profile.beside import Loads
+from lae_sim.profile.energy import at_rest
 from lae_sim.profile.gaps import BUDGET_NS, Gaps
 from lae_sim.profile.journal import Journal
 from lae_sim.profile.live import LiveRun, run_every_frame, run_real_time
@@ -54,6 +56,8 @@ from lae_sim.profile.passes import (
     warm_up,
     write_pass,
 )
+from lae_sim.profile.sampler import Sampler
+from lae_sim.profile.sensors import find_sensors
 from lae_sim.profile.timed import TimedTracker
 from lae_sim.profile.translation import Translated
 from lae_sim.profile.worker import InProcess, Worker
@@ -61,6 +65,7 @@ from lae_sim.progress import ProgressBar, ShowProgress, tell
 from lae_sim.replay.latency import time_label
 from lae_sim.replay.names import flag, named, parse_policy, several, text
 from lae_sim.replay.strides import phases
+from lae_sim.trace.describe import Facts
 from lae_sim.trace.file import check_replaces, read_trace
 from lae_sim.trace.metadata import text_fault
 
@@ -82,7 +87,8 @@ class ProfilePlan:
         python: interpreter of the worker process, 3.8 or newer; this one if None.
         in_process: run the tracker in this process, without timeouts: for debugging.
         threads: that the tracker's libraries may use; None leaves them as they are.
-        frame_timeout: what a call may take before its sequence is given up, ns.
+        frame_timeout: what a call may take before its sequence is given up, ns; None is 30 s, or
+            what the registry of a ``vot:`` tracker says.
         warmup: calls before anything is measured.
         dataset, root, sequences, box, fps, frame_times: the frames (see
             :func:`lae_sim.datasets.layouts.find_dataset`).
@@ -102,6 +108,9 @@ class ProfilePlan:
             for half an hour.
         repeat: how often the first pass is run.
         include_decode: whether times include the decoding of frames.
+        beside: commands of the shell that run while anything is measured, and are ended then.
+        idle: how long the power of the device at rest is measured before the tracker is started,
+            ns; where no sensor tells it, no time is spent.
 
     Raises:
         LaeError: if some do not go together.
@@ -113,7 +122,7 @@ class ProfilePlan:
     python: str | None = None
     in_process: bool = False
     threads: int | None = None
-    frame_timeout: int = 30 * NS_PER_SECOND
+    frame_timeout: int | None = None
     warmup: int = 5
     dataset: str | None = None
     root: str | Path | None = None
@@ -132,6 +141,8 @@ class ProfilePlan:
     gaps: int | None = None
     repeat: int = 1
     include_decode: bool = False
+    beside: Sequence[str] = ()
+    idle: int = 2 * NS_PER_SECOND
 
     def __post_init__(self) -> None:
         if self.mode not in (None, *MODES):
@@ -326,22 +337,27 @@ def _run(
         notice(said)
     failures: dict[str, list[Failure]] = {}
     interrupted: KeyboardInterrupt | None = None
-    with closing(_start(plan, notice)) as started:
+    sampler = Sampler(find_sensors())
+    with sampler, ExitStack() as around:
+        resting = at_rest(sampler, plan.idle / NS_PER_SECOND)
+        started = around.enter_context(closing(_start(plan, notice)))
         with suppress(LaeError):  # a tracker may import libraries, or reach the GPU, only now
             warm_up(started, dataset.sequences[0], min(plan.warmup, 1))
-        passes = _passes(plan, dataset, started, path, notice)
+        passes = _passes(plan, dataset, started, path, resting, notice)
         check_places(each.path for each in passes)
         _check_files(plan, passes, force)
         if path.exists() and not resume:
             notice(f"{path} will be replaced")
         described = {f"tracker's {key}": value for key, value in started.describe().items()}
         settled = {"lae_sim": __version__, **plan.settings(), **described}
+        loads = around.enter_context(Loads(plan.beside))  # which may fail, and leave nothing
         journal = Journal(unfinished, settled, resume)
         total = done = 0
 
         def advance(frames: int) -> None:
             nonlocal done
             done += frames
+            loads.watch()
             progress(done, total)
 
         with _kept(unfinished):
@@ -351,10 +367,14 @@ def _run(
                     total = sum(each.work(s) for each in passes for s in dataset.sequences)
                     advance(0)
                     failures[task.name] = run_pass(
-                        task, dataset, started, journal, plan.warmup, advance
+                        task, dataset, started, journal, plan.warmup, advance, sampler, loads
                     )
             except KeyboardInterrupt as error:
                 interrupted = error
+    for each in loads.ended():
+        notice(each)
+    for name, count in sampler.failures.items():
+        notice(f"{name}: {count} of {sampler.readings:,} readings failed: it says nothing of these")
     with _kept(unfinished):
         written = [t for t in passes if write_pass(t, journal, failures.get(t.name, []))]
     if not interrupted or not written:
@@ -480,6 +500,8 @@ _PARSERS: Mapping[str, Callable[[Any], Any]] = {
     "gaps": _gaps,
     "repeat": partial(whole, least=1),
     "include_decode": flag,
+    "beside": _each(text),
+    "idle": parse_duration,
 }
 
 
@@ -494,7 +516,7 @@ def _start(plan: ProfilePlan, notice: Callable[[str], object]) -> TimedTracker:
             plan.options,
             python=plan.python,
             threads=plan.threads,
-            timeout=plan.frame_timeout / NS_PER_SECOND,
+            timeout=plan.frame_timeout and plan.frame_timeout / NS_PER_SECOND,
         )
     needed = plan.pre_forecaster is not None and not tracker.sets_search
     if needed:
@@ -507,6 +529,7 @@ def _passes(
     dataset: Dataset,
     tracker: TimedTracker,
     out: Path,
+    resting: Facts,
     notice: Callable[[str], object],
 ) -> list[Pass]:
     """The first pass and its repetitions, the strided ones, the gap pass and the closed loops."""
@@ -516,7 +539,9 @@ def _passes(
     includes = "init and track calls" + (
         " and the decoding of frames" if plan.include_decode else "; frames decoded before"
     )
-    document = base_document(plan.tracker, tracker, dataset.name, clock, plan.warmup, includes)
+    document = base_document(
+        plan.tracker, tracker, dataset.name, clock, plan.warmup, includes, resting
+    )
     if dataset.frame_times:  # numbers are missing
         document["dataset"]["frame_times"] = dataset.frame_times
     live: dict[str, Any] = {"tracker": tracker, "include_decode": plan.include_decode}

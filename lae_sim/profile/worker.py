@@ -24,6 +24,7 @@ from lae_sim.datasets.frames import Image
 from lae_sim.errors import LaeError, described, one_line
 from lae_sim.profile.timed import Answer, TrackerError
 from lae_sim.progress import tell
+from lae_sim.trackers.names import usual_timeout
 from lae_sim.trackers.protocol import checked_frame
 from lae_sim.trackers.runtimes import THREAD_VARIABLES
 from lae_sim.trackers.stopwatch import Stopwatch
@@ -80,7 +81,8 @@ class Worker(_Asked):
         options: keyword arguments of its factory (JSON values).
         python: an interpreter, Python 3.8 or newer with NumPy; None is this one.
         threads: threads that the tracker's libraries may use; None leaves them as they are.
-        timeout: seconds that a call may take.
+        timeout: seconds that a call may take; None is the tracker's usual
+            (`lae_sim.trackers.names.usual_timeout`).
         setup_timeout: seconds that starting the process and making the tracker may take.
 
     Raises:
@@ -93,7 +95,7 @@ class Worker(_Asked):
         options: Mapping[str, Any],
         python: str | None = None,
         threads: int | None = None,
-        timeout: float = 30.0,
+        timeout: float | None = None,
         setup_timeout: float = 300.0,
     ) -> None:
         if os.name != "posix":
@@ -101,7 +103,8 @@ class Worker(_Asked):
         self._tracker, self._threads = tracker, threads
         self._setup = {"tracker": tracker, "options": dict(options), "threads": threads}
         self._python = python or sys.executable
-        self._timeout, self._setup_timeout = timeout, setup_timeout
+        self._timeout = usual_timeout(tracker, options) if timeout is None else timeout
+        self._setup_timeout = setup_timeout
         self._process: subprocess.Popen[bytes] | None = None
         self._control: Connection
         self._lifeline = -1

@@ -13,6 +13,7 @@ from .latency import (
 from .names import parse_latency, parse_policy
 from .pipeline import parse_pipeline, parse_time, read_pipeline
 from .reach import OwnJump, Reach, Restart, fit_reach, own_jumps, restarts_of
+from .recorded import AsRecorded
 from .run import Repetitions, Run, RunBatch, Runs, replay_repeated, replay_sequence
 from .search import Outcomes, SearchModel, find_search
 from .strides import followed, phases
@@ -26,6 +27,7 @@ from .world import (
 
 __all__ = [
     "SIGMA_GRID",
+    "AsRecorded",
     "LatencySource",
     "Outcomes",
     "OwnJump",

@@ -15,9 +15,10 @@ from lae_sim.errors import LaeError, hint, shown
 from lae_sim.plugins import bound, imported, with_options
 from lae_sim.replay import latency as sources
 from lae_sim.replay.latency import Initialised, LatencySource, initialised, time_label
+from lae_sim.replay.recorded import RECORDED_POLICY, AsRecorded
 from lae_sim.trace.file import Trace
 
-POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime")
+POLICIES = ("latest", "fifo", "every", "shrinking-tail", "vot-realtime", "recorded")
 LATENCIES = ("recorded", "by-call", "stage", "constant", "resample", "lognormal", "bootstrap")
 """The names of those that come with the package, before their values."""
 
@@ -36,6 +37,10 @@ class Plugin:
     label: str
     made: Any = field(compare=False)
 
+    def __call__(self, *arguments: Any) -> Any:
+        """What it makes of some arguments."""
+        return self.made(*arguments)
+
 
 def parse_policy(text: str) -> Policy:
     """A policy by name.
@@ -51,18 +56,20 @@ def parse_policy(text: str) -> Policy:
         return policies.latest
     if text == "fifo":
         return policies.fifo
+    if text == RECORDED_POLICY:
+        return AsRecorded()
     if name == "every":
         return policies.every(_number(text, value, least=1))
     if name == "shrinking-tail" and value:
         return policies.shrinking_tail(value)
     if name == "vot-realtime":
         return policies.vot_realtime(*([_number(text, value)] if value else []))
-    if colon and name not in ("latest", "fifo", "shrinking-tail"):
+    if colon and name not in ("latest", "fifo", "shrinking-tail", RECORDED_POLICY):
         policy: Policy = _plugin("policy", text, POLICIES, ("clock", "calls"))
         return policy
     raise LaeError(
         f"no policy {text!r}: there are latest, fifo, every:N, shrinking-tail:TIME, "
-        f"vot-realtime[:GRACE], package.module:object{hint(name, POLICIES)}"
+        f"vot-realtime[:GRACE], recorded, package.module:object{hint(name, POLICIES)}"
     )
 
 

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lae_sim.decoding import read_toml
-from lae_sim.engine.clock import Clock, exact, parse_duration, whole
+from lae_sim.engine.clock import Clock, exact, parse_duration, split_init, whole
 from lae_sim.engine.pipeline import CAMERA, Camera, Pipeline, Stage, TimeSource
 from lae_sim.engine.scheduler import Service
 from lae_sim.errors import LaeError, explained, hint, listed, shown
@@ -49,16 +49,18 @@ from lae_sim.replay.latency import (
     Uniform,
     by_call,
     by_frame,
+    initialised,
     scaled,
     stream,
 )
-from lae_sim.replay.names import LATENCIES, named, parse_latency, text
+from lae_sim.replay.names import LATENCIES, Plugin, kind_of, named, parse_latency
 from lae_sim.trace.recording import Recording
 
 if TYPE_CHECKING:
     from lae_sim.engine.stages import PipelineSchedule
 
 _RANGE = re.compile(r"([0-9.]+[a-z]+)-([0-9.]+[a-z]+):([0-9]+)\Z")
+_TIMES = (*LATENCIES, "uniform")
 _SHARE = re.compile(r"([0-9./]+):([0-9]+)\Z")
 
 
@@ -102,19 +104,12 @@ def parse_pipeline(document: Mapping[str, Any], name: str = "pipeline") -> Pipel
     stages = values.get("stages")
     if not isinstance(stages, (list, tuple)) or not stages:
         raise LaeError("stages: a pipeline has at least one: [[stages]], with its name")
-    for key in ("name", "tracker"):
-        if key in values:
-            named(key, text, values[key])
-    resources = values.get("resources", {})
-    if not isinstance(resources, Mapping):
-        raise LaeError(f"resources: a table of whole numbers by name, not {shown(resources)}")
     values |= {
         "name": values.get("name", name),
         "camera": Camera(**_checked("camera", values.get("camera", {}), Camera)),
-        "resources": dict(resources),
         "stages": [_stage(place, each) for place, each in enumerate(stages, 1)],
     }
-    pipeline = Pipeline(**values)
+    pipeline = with_plugins(Pipeline(**values))
     PipelineTimes.of(pipeline)  # whose names are looked up
     return pipeline
 
@@ -151,16 +146,20 @@ def parse_time(name: str) -> LatencySource:
 
     Args:
         name: as :func:`.names.parse_latency` takes it; or ``"6ms"``, for ``"constant:6ms"``; or
-            ``"uniform:0ms-8ms:SEED"``, drawn evenly.
+            ``"uniform:0ms-8ms:SEED"``, drawn evenly; all of them perhaps with ``,init=TIME``.
 
     Raises:
         LaeError: if it is none of these.
     """
+    alone, init_ns = split_init(name)
+    if init_ns is not None:
+        return initialised(parse_time(alone), init_ns)
     kind, _, value = name.partition(":")
     if kind == "uniform":
         if (found := _RANGE.match(value)) is None:
             raise LaeError(f"{name!r}: write uniform:LOW-HIGH:SEED, such as uniform:0ms-8ms:1")
-        return Uniform(parse_duration(found[1]), parse_duration(found[2]), int(found[3]))
+        seed = named("SEED", whole, found[3])
+        return Uniform(parse_duration(found[1]), parse_duration(found[2]), seed)
     if name[:1].isdigit() and name[-1:] == "s":
         return Constant(parse_duration(name))
     try:
@@ -169,6 +168,25 @@ def parse_time(name: str) -> LatencySource:
         if kind in LATENCIES or ":" in name:
             raise
         raise LaeError(f"{error}; or a duration, 6ms, or uniform:LOW-HIGH:SEED") from error
+
+
+def with_plugins(pipeline: Pipeline) -> Pipeline:
+    """The pipeline with what its times name of a user's own, made once.
+
+    Raises:
+        LaeError: if there is none of a name; it names the stage and the key.
+    """
+
+    def made(what: str, time: TimeSource | None) -> TimeSource | None:
+        own = isinstance(time, str) and ":" in time and kind_of(time) not in _TIMES
+        return Plugin(str(time), named(what, parse_time, time)) if own else time
+
+    camera, stages = pipeline.camera, pipeline.stages
+    return replace(
+        pipeline,
+        camera=replace(camera, jitter=made("camera: jitter", camera.jitter)),
+        stages=[replace(s, time=made(f"stage {s.name!r}: time", s.time)) for s in stages],
+    )
 
 
 def parse_drops(drops: Any) -> Callable[[Recording], frozenset[int]]:
@@ -186,7 +204,7 @@ def parse_drops(drops: Any) -> Callable[[Recording], frozenset[int]]:
     if kind == "share" and (found := _SHARE.match(value)):
         share = named("drops", exact, found[1])
         if 0 <= share < 1:
-            return partial(_share, share, int(found[2]))
+            return partial(_share, share, named("drops: SEED", whole, found[2]))
     raise LaeError(
         f"drops: {shown(drops)}: write every:N, share:P:SEED with P from 0 to below 1, or a list "
         "of frames"
@@ -246,6 +264,20 @@ class PipelineTimes:
                 )
         return cls(pipeline, found, jitter, named("camera", parse_drops, camera.drops), scale)
 
+    def of_tracker(self, recording: Recording) -> Recording:
+        """A recording whose times are those of the tracker alone.
+
+        What it says of the pipeline's other stages is a part of the call's time, and would count
+        twice: it is taken off.
+        """
+        apart = {stage for stage in self.sources if stage != self.pipeline.tracker}
+        for stage in tuple(apart):
+            apart.update(_recorded_stages(self.sources[stage]))
+        elapsed = recording.elapsed_ns
+        for stage in apart & recording.stages.keys():
+            elapsed = elapsed - np.maximum(recording.stages[stage], 0)
+        return replace(recording, elapsed_ns=elapsed)
+
     def schedule(
         self, recording: Recording, clock: Clock, tracker: Service, repetition: int = 0
     ) -> PipelineSchedule:
@@ -280,14 +312,24 @@ class PipelineTimes:
 
     def _service(self, stage: str, recording: Recording, repetition: int) -> Service:
         source = _repeated(self.sources[stage], repetition)
+        drawn = _draws_on_recorded(source)
+        for name in (stage,) if drawn else _recorded_stages(source):
+            if name not in recording.stages:
+                raise LaeError(
+                    f"sequence {recording.name!r}: the trace has no times of stage {name!r}: give "
+                    f"the pipeline's stage {stage!r} a time, such as '6ms'"
+                )
         own = _named_after(stage, recording)
         with explained(f"stage {stage!r}: time"):
-            if _draws_on_recorded(source):
+            if drawn:
                 own = replace(own, elapsed_ns=StageTimes((stage,))(own).ns)
             return scaled(source, self.scale)(own)
 
 
 def _source(what: str, source: TimeSource) -> LatencySource:
+    if isinstance(source, Plugin):
+        made: LatencySource = source.made
+        return made
     if isinstance(source, str):
         return named(what, parse_time, source)
     if not callable(source):
@@ -296,6 +338,8 @@ def _source(what: str, source: TimeSource) -> LatencySource:
 
 
 def _repeated(source: LatencySource, repetition: int) -> LatencySource:
+    if isinstance(source, Initialised):
+        return replace(source, source=_repeated(source.source, repetition))
     if isinstance(source, (RandomSource, Uniform)):
         return replace(source, repetition=source.repetition + repetition)
     return source
@@ -306,6 +350,13 @@ def _draws_on_recorded(source: LatencySource) -> bool:
     if isinstance(source, Initialised):
         return _draws_on_recorded(source.source)
     return source in (by_frame, by_call) or isinstance(source, RandomSource)
+
+
+def _recorded_stages(source: LatencySource) -> tuple[str, ...]:
+    """The recorded stages whose times a source takes."""
+    if isinstance(source, Initialised):
+        return _recorded_stages(source.source)
+    return source.stages if isinstance(source, StageTimes) else ()
 
 
 def _named_after(stage: str, recording: Recording) -> Recording:

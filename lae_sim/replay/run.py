@@ -23,6 +23,7 @@ from lae_sim.errors import LaeError, explained, shown
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
 from lae_sim.replay.passes import split_passes
 from lae_sim.replay.pipeline import PipelineTimes
+from lae_sim.replay.recorded import RECORDED_POLICY, AsRecorded
 from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import HELD_FRAMES, Trace
@@ -126,7 +127,7 @@ def replay_sequence(
     if isinstance(image_size, tuple):
         image_size = ImageSizes.constant(image_size)
     job = _Job(recording, times, strided or {}, clock, stride, search, image_size)
-    schedule = simulate(len(recording), job.clock, source(job.times), policy)
+    schedule = simulate(len(recording), job.clock, source(job.times), _rule(policy, job))
     return _run([job], Schedules.of([schedule]), np.zeros(1, np.int64))[0]
 
 
@@ -522,12 +523,18 @@ class Runs:
         return "forgotten" if self.forget_arrivals else "recorded"
 
     def notes(self) -> list[str]:
-        """A note on when frames arrive, if the trace says so."""
+        """Notes on a log's own schedule, and on when frames arrive, if the trace says so."""
+        notes = []
+        schedule = self.times.metadata.document["schedule"]
+        if schedule.get("policy") == RECORDED_POLICY and not isinstance(self.policy, AsRecorded):
+            notes.append(
+                "the times are those of a log, whose own schedule policy 'recorded' repeats"
+            )
         if self.arrivals is None:
-            return []
+            return notes
         if self.forget_arrivals:
-            return ["the trace's arrival times are forgotten: frames arrive evenly"]
-        return ["frames arrive when the trace says that they did, not evenly"]
+            return [*notes, "the trace's arrival times are forgotten: frames arrive evenly"]
+        return [*notes, "frames arrive when the trace says that they did, not evenly"]
 
     @property
     def strided(self) -> tuple[Trace, ...]:
@@ -573,6 +580,10 @@ class Runs:
                 self.search,
                 self.trace.metadata.image_sizes(recording.name),
             )
+
+    def of_tracker(self, times: Recording) -> Recording:
+        """The times that are the tracker's, if it is one of a pipeline's stages."""
+        return times if self.pipeline is None else self.pipeline.of_tracker(times)
 
     def __repr__(self) -> str:
         return f"<Runs of {self.trace!r} at {self.clock.fps} fps>"
@@ -639,7 +650,7 @@ def _groups(
     for place, runs in replays:
         for job in runs._jobs():
             with explained("latency"):
-                service = runs.source(job.times)
+                service = runs.source(runs.of_tracker(job.times))
             places.append(place)
             jobs.append(job)
             services.append(service)
@@ -702,7 +713,8 @@ class Repetitions:
             size = max(_LANE_FRAMES // sum(map(len, jobs)), 1)
             for begin in range(first, first + count, size):
                 some = range(begin, min(begin + size, first + count))
-                drawn = [source.repeated(job.times, begin, len(some)) for job in jobs]
+                recorded = [self.runs.of_tracker(job.times) for job in jobs]
+                drawn = [source.repeated(each, begin, len(some)) for each in recorded]
                 times = [
                     Times(job.recording.name, rows[k], by_call=True)
                     for k in range(len(some))
@@ -728,8 +740,11 @@ def _replayed(
                 schedule = pipeline.schedule(job.times, job.clock, service, number)
             yield _run([job], Schedules.of([schedule]), np.array([number]))
         return
-    clocks = [job.clock for job in jobs]
-    schedules = simulate_many([len(job) for job in jobs], clocks, services, policy)
+    clocks, lengths = [job.clock for job in jobs], [len(job) for job in jobs]
+    if isinstance(policy, AsRecorded):
+        schedules = _as_recorded(jobs, services, policy)
+    else:
+        schedules = simulate_many(lengths, clocks, services, policy)
     begin = 0
     while begin < len(jobs):
         with explained(f"sequence {jobs[begin].recording.name!r}: policy or latency"):
@@ -737,6 +752,19 @@ def _replayed(
         those = slice(begin, begin + len(some))
         yield _run(jobs[those], some, repetition[those])
         begin += len(some)
+
+
+def _as_recorded(
+    jobs: Sequence[_Job], services: Sequence[Service], policy: Policy
+) -> Iterator[Schedules]:
+    """The schedules of sequences that have rules of their own, one by one."""
+    for job, service in zip(jobs, services):
+        yield Schedules.of([simulate(len(job), job.clock, service, _rule(policy, job))])
+
+
+def _rule(policy: Policy, job: _Job) -> Policy:
+    """The policy of one sequence."""
+    return policy.of(job.times) if isinstance(policy, AsRecorded) else policy
 
 
 def _recordings(trace: Trace, forget_arrivals: bool) -> Iterator[Recording]:

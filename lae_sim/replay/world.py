@@ -41,7 +41,7 @@ from lae_sim.replay.names import (
     text,
 )
 from lae_sim.replay.passes import split_passes
-from lae_sim.replay.pipeline import PipelineTimes, parse_time, read_pipeline
+from lae_sim.replay.pipeline import PipelineTimes, parse_time, read_pipeline, with_plugins
 from lae_sim.replay.run import Runs
 from lae_sim.replay.search import find_search, parse_search
 from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
@@ -165,6 +165,11 @@ class World:
         if not all(isinstance(n, (Fraction, int)) and not isinstance(n, bool) for n in numbers):
             raise LaeError("scale and sigmas of a World are exact; World.of takes text too")
         if self.pipeline is not None:
+            if not isinstance(self.pipeline, Pipeline):
+                raise LaeError(
+                    f"pipeline: a Pipeline, or the path of its file, not {shown(self.pipeline)}"
+                )
+            object.__setattr__(self, "pipeline", with_plugins(self.pipeline))
             object.__setattr__(self, "latency", self._tracker_latency(self.pipeline))
         scaled(self.source(), self.scale)
         check_sigmas(self.sigmas)
@@ -177,8 +182,6 @@ class World:
 
     def _tracker_latency(self, pipeline: Pipeline) -> str | LatencySource | Plugin:
         """The world's latency, which is that of the pipeline's tracker if this has one."""
-        if not isinstance(pipeline, Pipeline):
-            raise LaeError(f"pipeline: a Pipeline, or the path of its file, not {shown(pipeline)}")
         if self.rule() is not policies.latest:
             raise LaeError(
                 f"policy: {label_of(self.policy)} does not go with a pipeline, whose queues say "
@@ -188,10 +191,13 @@ class World:
         time = next(each.time for each in pipeline.stages if each.name == pipeline.tracker)
         if time is None:
             return self.latency
-        own: str | LatencySource = time
-        if isinstance(time, str) and hasattr(source := parse_time(time), "label"):
-            own = source
-        if self.latency not in ("recorded", own):
+        own: str | LatencySource | Plugin = time
+        if isinstance(time, str):
+            source = parse_time(time)
+            every = source.source if isinstance(source, Initialised) else source
+            own = source if hasattr(every, "label") else time
+        alike = isinstance(self.latency, str) and label_of(self.latency) == label_of(own)
+        if not (alike or self.latency in ("recorded", own)):
             raise LaeError(
                 f"latency: {label_of(self.latency)}, and the pipeline says {label_of(own)}: leave "
                 f"out the time of its stage {pipeline.tracker!r}"
@@ -472,10 +478,10 @@ def _made(name: str, given: Any, parse: Callable[[str], object], known: Iterable
 
 
 def _pipeline(given: Any) -> Pipeline | None:
-    """A pipeline, read if it is the path of a file."""
+    """A pipeline, read if it is the path of a file, whose plug-ins are made."""
     if isinstance(given, (str, os.PathLike)):
         return named("pipeline", read_pipeline, given)
-    made: Pipeline | None = given
+    made: Pipeline | None = with_plugins(given) if isinstance(given, Pipeline) else given
     return made
 
 

@@ -245,6 +245,8 @@ def _sections(view: View, root: str | os.PathLike[str] | None) -> Iterator[Secti
     yield Section("sweeps", "Over permitted latency, speed and rate", pictures=sweeps)
     front = _known(study_figures.front(view))
     yield Section("front", "Accuracy against time", pictures=front)
+    energy = _known(study_figures.front(view, study_figures.ENERGY))
+    yield Section("energy", "Accuracy against energy", pictures=energy)
     yield Section("gains", "What forecasters win", pictures=_known(study_figures.gains(view)))
     sequences, texts = close_ups(view, root)
     yield Section("sequences", "Frame by frame", texts=texts, close_ups=sequences)

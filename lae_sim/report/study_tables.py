@@ -130,6 +130,16 @@ _RANKING = (
            "share of sequences in which an answer misses the target wholly", importance=3),
     Column("to failure s", "time_to_failure_ms", Number(".1f", 1e-3), "median time to the first "
            "such answer (Kaplan and Meier); unknown if less than half fail", importance=3),
+    Column("J/frame", "joules_per_frame", Number(".3g"), "energy of the device during a call",
+           importance=6),
+    Column("W", "watts", Number(".3g"), "mean power of the device while it tracks: that at rest, "
+           "and what each processed frame takes above it", importance=4),
+    Column("AUC/W", "auc_per_watt", Number(".3g"), "the AUC that is ranked, over this power",
+           importance=6),
+    Column("energy front", lambda row: Cell("★" if row.get("energy_pareto") else "",
+                                            int(row.get("energy_pareto", False))),
+           meaning="with the same forecaster, no other trace takes less energy and is better",
+           name="energy_pareto"),
     Column("front", lambda row: Cell("★" if row["pareto"] else "", int(row["pareto"])),
            meaning="with the same forecaster, no other trace is both faster and better",
            name="pareto"),
@@ -148,7 +158,7 @@ _REQUIRED = (
 )  # of them in a column of a paper
 _TERMINAL = ("n", "AUC", "modelled", "ranked by", "jitter", "offline", "recovered", "vs hold", "p",
              "vs best", "p (best)", "DP", "ms/call", "init ms", "skipped", "age ms",
-             "front")  # fmt: skip
+             "J/frame", "AUC/W", "front")  # fmt: skip
 _INTERVALS = ("AUC", "mAUC", "modelled", "jitter", "AUC of a - b", "mAUC of a - b")
 
 
@@ -178,6 +188,8 @@ def ranking(
     left_out = set() if any("auc_jitter_low" in row for row in rows) else {"jitter"}
     if not any(row.modelled for row in shown):
         left_out |= {"modelled", "modelled DP", "lost"}
+    if not any(row.energy for row in shown):
+        left_out |= {"J/frame", "W", "AUC/W", "energy front"}
     if len({row.ranked_by for row in shown}) == 1:
         left_out.add("ranked by")
     columns = [

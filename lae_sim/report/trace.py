@@ -6,7 +6,7 @@ import math
 import re
 import shutil
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from operator import itemgetter
@@ -17,6 +17,7 @@ from lae_sim.figures.style import BLUE, SKY_BLUE, VERMILION, new_figure, save, s
 from lae_sim.figures.times import draw_times, name_durations
 from lae_sim.report.table import COUNT, Column, Number, Table, text_of
 from lae_sim.trace.describe import InitCost, Report, gathered
+from lae_sim.trace.energy import Energy
 
 if TYPE_CHECKING:
     from lae_sim.profile.passes import PassSummary
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 _WIDTH, _INDENT, _BAR, _STALLS = 96, 13, 50, 10
 _UNNAMED = ("name", "model", "kind", "source")  # whose values say what they are
+_JOULES = Number(".3g")
+_MEASURED = ("readings", "energy", "clocks", "slowdowns", "unread", "beside")  # told apart
 _FIGURES: dict[str, Callable[[Any], float]] = {
     "CPU clock, MHz": lambda taken: taken["cpu_mhz"]["highest"],
     "CPU clock allowed": lambda taken: taken["cpu_mhz"]["allowed"],
@@ -38,12 +41,15 @@ def overview(report: Mapping[str, Any]) -> str:
     provenance, times, failures = report["provenance"], report["times"], report["failures"]
     lines = [_words(report["trace"]), ""]
     for key in dict.fromkeys(["tracker", "device", "timing", "schedule", "dataset", *provenance]):
-        if key in provenance:
+        if key == "device" and isinstance(provenance.get(key), dict):
+            device = {k: v for k, v in provenance[key].items() if k not in _MEASURED}
+            lines += [*_section(key, device), *_beside(provenance[key])]
+        elif key in provenance:
             lines += _section(key, provenance[key])
     lines.append(_entry("frames", _frames(report)))
     if failures:
         lines.append(_entry("failures", f"{len(failures)}: {_words(failures[:5])}"))
-    lines += [*_readings(provenance.get("device")), "", *_times(report)]
+    lines += [*_readings(provenance.get("device")), *_power(provenance), "", *_times(report)]
     if times["stages"]:
         lines += ["", *_stages(times["stages"])]
     if times["histogram"]:
@@ -65,7 +71,7 @@ def _section(label: str, section: Any) -> list[str]:
         return [_entry(label, section)]
     inner = {key: value for key, value in section.items() if value and _has_keys(value)}
     lines = [_entry(label, {key: value for key, value in section.items() if key not in inner})]
-    return lines + [_entry(f"  {key}", inner[key]) for key in inner if key != "readings"]
+    return lines + [_entry(f"  {key}", inner[key]) for key in inner]
 
 
 def _has_keys(value: Any) -> bool:
@@ -140,6 +146,45 @@ def _range(taken: Any, figure: Callable[[Any], float]) -> str:
     for one in taken if isinstance(taken, list) else [taken]:
         values += gathered(value=lambda one=one: float(figure(one))).values()  # type: ignore[misc]
     return " to ".join(dict.fromkeys(map(_figure, [min(values), max(values)]))) if values else ""
+
+
+def _beside(device: Mapping[str, Any]) -> list[str]:
+    """What else ran while the tracker was measured."""
+    loads = device.get("beside")
+    known = [load for load in loads if isinstance(load, dict)] if isinstance(loads, list) else []
+    return [_entry("  beside", load.get("command")) for load in known]
+
+
+def _power(provenance: Mapping[str, Any]) -> list[str]:
+    """Power, energy and clocks during the calls; nothing where they were not sampled."""
+    energy, lines = Energy.of(provenance), []
+    if energy is not None:
+        columns = [
+            Column("power, W", itemgetter(0), is_label=True),
+            Column("during calls", itemgetter(1), _figure),
+            Column("at rest", lambda row: energy.idle_w.get(row[0]), _figure),
+        ]
+        rails = sorted(energy.power_w.items(), key=lambda rail: rail[0] not in energy.total)
+        table = Table.of(columns, rails)
+        lines += ["", *text_of(table).splitlines(), *_joules(energy)]
+    # another program may have written anything there
+    clocks = gathered(
+        mhz=lambda: {k: f"{v:,.0f}" for k, v in provenance["device"]["clocks"].items()}
+    )
+    for name, mhz in clocks.get("mhz", {}).items():
+        lines.append(f"{_words(name.removesuffix('_mhz').upper())} at {mhz} MHz during the calls")
+    return ["", *lines] if lines and energy is None else lines
+
+
+def _joules(energy: Energy) -> Iterator[str]:
+    """Sentences about the energy of a call."""
+    joules, above = energy.joules_per_frame, energy.joules_above_idle
+    rails = _words(" + ".join(energy.total))
+    if joules is None:
+        yield "the power of the whole device is not known"
+        return
+    more = "" if above is None else f", {_JOULES(above)} J of it above that at rest"
+    yield f"a call takes {_JOULES(joules)} J ({rails}){more}; initialisations are not counted"
 
 
 def _times(report: Mapping[str, Any]) -> list[str]:
@@ -232,6 +277,8 @@ def profile_table(passes: Sequence[PassSummary], width: int | None = None) -> st
         Column("median ms", "median_ms", ms, importance=9),
         Column("p95 ms", "p95_ms", ms),
     ]
+    if any(each.joules_per_frame is not None for each in passes):
+        columns.append(Column("J/frame", "joules_per_frame", _JOULES))
     return text_of(Table.of(columns, passes), width=width)
 
 

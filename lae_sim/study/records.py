@@ -129,6 +129,34 @@ class Staleness:
 
 
 @dataclass(frozen=True, slots=True)
+class Consumption:
+    """What a tracker takes from its device, where the power during its calls was measured.
+
+    Attributes:
+        joules_per_frame: energy of the device during a call, J.
+        joules_above_idle: the part above the power at rest, J; None if that was not measured.
+        watts: mean power of the device while it tracks in this world: that at rest, and what each
+            processed frame takes above it; None if that is not known.
+        pareto: whether no other trace takes less energy for a call and is better.
+    """
+
+    joules_per_frame: float
+    joules_above_idle: float | None
+    watts: float | None
+    pareto: bool = False
+
+    def columns(self, auc: float | None) -> dict[str, Plain]:
+        """Values by their keys in a flat row, with the AUC that is ranked."""
+        return {
+            "joules_per_frame": self.joules_per_frame,
+            "joules_above_idle": self.joules_above_idle,
+            "watts": self.watts,
+            "auc_per_watt": None if auc is None or not self.watts else auc / self.watts,
+            "energy_pareto": self.pareto,
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class Modelled:
     """Mean scores under the search model.
 
@@ -177,6 +205,8 @@ class SummaryRow(Record):
         uncertainty: of AUC and DP, in the rows of the first sigma and of the mean over the grid;
             where the reach is known of ``modelled_auc`` and ``modelled_dp20`` too.
         staleness: of each sigma; None of their mean.
+        energy: of a call; None where the device's power was not measured, or the times are not
+            those that were.
         modelled: scores under the search model; None where it says nothing.
         ranked_by: ``"modelled"`` or ``"recorded"`` (see
             :class:`lae_sim.evaluation.modelled.Ranking`).
@@ -212,6 +242,7 @@ class SummaryRow(Record):
     offline: Mapping[str, float | None]
     uncertainty: Mapping[str, Uncertainty] = field(default_factory=dict)
     staleness: Staleness | None = None
+    energy: Consumption | None = None
     modelled: Modelled | None = None
     ranked_by: str = "recorded"
     pareto: bool = False
@@ -241,6 +272,8 @@ class SummaryRow(Record):
             row |= uncertainty.columns(metric)
         if self.staleness is not None:
             row |= self.staleness.columns()
+        if self.energy is not None:
+            row |= self.energy.columns(self.score("auc"))
         if self.modelled is not None:
             row |= self.modelled.columns()
         row |= {"ranked_by": self.ranked_by, "pareto": self.pareto}

@@ -7,7 +7,7 @@ for these very sequences.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -30,6 +30,7 @@ from lae_sim.study.plan import Plan, Source
 from lae_sim.study.records import (
     MEAN,
     Behind,
+    Consumption,
     Modelled,
     Staleness,
     SummaryRow,
@@ -48,6 +49,8 @@ from lae_sim.study.uncertainty import (
     uncertainty_of,
 )
 from lae_sim.trace.columns import to_numpy
+from lae_sim.trace.energy import Energy
+from lae_sim.trace.metadata import Metadata
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +59,7 @@ class Scores:
 
     Attributes:
         source: the trace.
+        timed: the trace that the times come from.
         setting: the first of the settings, which differ in their repetitions.
         forecaster, convention: names.
         sequences: names, S of them.
@@ -80,6 +84,7 @@ class Scores:
     """
 
     source: Source
+    timed: Source
     setting: Setting
     forecaster: str
     convention: str
@@ -132,6 +137,7 @@ class Scores:
 FEW = 20_000
 """Sequences of missing answers, about, that are sooner resampled here than handed to workers."""
 
+_MEASURED = ("recorded", "by-call", "resample", "lognormal")  # latencies of a trace's own times
 _AS_DEAR = 30  # sequences as the rest of an answer
 _PIECE = 128  # answers
 _WORST = {"age_max", "longest_stale"}
@@ -242,6 +248,7 @@ def _read(
     for n, group in enumerate(groups):
         yield Scores(
             source=sources[group[0].setting.trace],
+            timed=sources[group[0].setting.timing or group[0].setting.trace],
             setting=group[0].setting,
             forecaster=group[0].forecaster,
             convention=group[0].convention,
@@ -388,6 +395,10 @@ def summarise_study(
     for places in rivals.values():
         for place in _front([rows[place] for place in places]):
             rows[places[place]] = replace(rows[places[place]], pareto=True)
+        for place in _front([rows[place] for place in places], _joules):
+            row = rows[places[place]]
+            if row.energy is not None:
+                rows[places[place]] = replace(row, energy=replace(row.energy, pareto=True))
     for some in ranks.values():
         ranked_rows = [(rows[place], each) for place, each in some]
         behind = _behind(ranked_rows, rankings[some[0][1].group], how, answers)
@@ -470,6 +481,7 @@ def _rows(
         scores={},
         offline={metric: _mean(scores.once[f"offline_{metric}"]) for metric in METRICS},
     )
+    row = replace(row, energy=_energy(row, scores.timed.metadata))
     for s, sigma in enumerate(sigmas):
         yield replace(
             row,
@@ -488,6 +500,25 @@ def _rows(
             uncertainty=_uncertainty(_key(scores, hold, True, how), answers) if whole else {},
             modelled=_modelled(scores, grid, "mean" if whole else None),
         )
+
+
+def _energy(row: SummaryRow, timed: Metadata) -> Consumption | None:
+    """What the calls of a row take, at the power that was measured when its times were.
+
+    Args:
+        row: whose times are as they were measured, or drawn from those.
+        timed: of the trace that they come from.
+    """
+    energy = Energy.of(timed.document)
+    if energy is None or row.scale != 1 or row.elapsed_ms is None or energy.watts is None:
+        return None
+    if row.latency.partition(":")[0].partition(",")[0] not in _MEASURED or timed.timing_note:
+        return None
+    seconds, rest = row.elapsed_ms / 1e3, energy.idle_watts
+    above = None if rest is None else (energy.watts - rest) * seconds
+    processed_per_second = float(row.fps) * (1 - row.skip_rate)
+    watts = None if rest is None or above is None else rest + above * processed_per_second
+    return Consumption(energy.watts * seconds, above, watts)
 
 
 def _modelled(scores: Scores, at: Sequence[int], draws: str | None) -> Modelled | None:
@@ -620,22 +651,32 @@ def _median_survival(times: Floats, failed: Bools) -> float | None:
     return None
 
 
-def _front(rivals: Sequence[SummaryRow]) -> list[int]:
-    """Those on the Pareto front of rivals: no other has a higher AUC and faster calls.
+def _elapsed_ms(row: SummaryRow) -> float | None:
+    return row.elapsed_ms
+
+
+def _joules(row: SummaryRow) -> float | None:
+    return None if row.energy is None else row.energy.joules_per_frame
+
+
+def _front(
+    rivals: Sequence[SummaryRow], cost_of: Callable[[SummaryRow], float | None] = _elapsed_ms
+) -> list[int]:
+    """Those on the Pareto front of rivals: no other has a higher AUC and calls that cost less.
 
     Rivals are the traces with the same sequences, world, latency, convention, forecaster and sigma.
     """
     known = [
-        (place, auc, row.elapsed_ms)
+        (place, auc, cost)
         for place, row in enumerate(rivals)
-        if (auc := row.score("auc")) is not None and row.elapsed_ms is not None
+        if (auc := row.score("auc")) is not None and (cost := cost_of(row)) is not None
     ]
     return [
         place
-        for place, auc, ms in known
+        for place, auc, cost in known
         if not any(
-            other >= auc and others_ms <= ms and (other, others_ms) != (auc, ms)
-            for _, other, others_ms in known
+            other >= auc and others_cost <= cost and (other, others_cost) != (auc, cost)
+            for _, other, others_cost in known
         )
     ]
 

@@ -58,7 +58,7 @@ def _stage_types(columns: Iterable[str], where: str) -> dict[str, str]:
     """The types of those columns that have the times of stages."""
     types = {}
     for column in columns:
-        if found := re.fullmatch("stage_(.*)_ns", column):
+        if found := re.fullmatch("(?s)stage_(.*)_ns", column):
             try:
                 types[stage_column(found[1])] = "int64"
             except LaeError as error:

@@ -246,7 +246,10 @@ Facts = dict[str, Any]
 
 
 def throttling(
-    before: Mapping[str, Any], during: Sequence[Mapping[str, Any]], after: Mapping[str, Any]
+    before: Mapping[str, Any],
+    during: Sequence[Mapping[str, Any]],
+    after: Mapping[str, Any],
+    slowdowns: Mapping[str, float] | None = None,
 ) -> str | None:
     """What readings say of throttling during a profile, in one sentence; None if nothing.
 
@@ -257,6 +260,8 @@ def throttling(
         before: what ``readings`` returned before the profile.
         during: what it returned in the course of it.
         after: what it returned at the end.
+        slowdowns: shares of the time of calls during which the GPU gave a reason to slow down,
+            which say more than readings.
     """
     signs = []
     everything = [before, *during, after]
@@ -264,7 +269,10 @@ def throttling(
     for name in counters[0] if counters else ():
         if (rise := counters[-1].get(name, 0) - counters[0][name]) > 0:
             signs.append(f"{name} rose by {rise}")
-    for reason, count in Counter(s for r in during for s in r.get("gpu_slowdowns", ())).items():
+    for reason, share in (slowdowns or {}).items():
+        signs.append(f"the GPU reported {reason} during {100 * share:.3g}% of the calls' time")
+    counted = [] if slowdowns else during
+    for reason, count in Counter(s for r in counted for s in r.get("gpu_slowdowns", ())).items():
         signs.append(f"the GPU reported {reason} in {count} of {len(during)} readings")
     for unit in ("CPU", "GPU"):
         for key, readings in (("allowed", everything), ("highest", during)):
@@ -374,10 +382,31 @@ def _warnings(report: Report, metadata: Metadata) -> Iterator[str]:
         busy=lambda: _busy(taken["before"]["load"][0], device["cpu"]),
         threads=lambda: _beyond(metadata.document["timing"]),
         throttled=lambda: throttling(
-            taken.get("before", {}), taken.get("during", []), taken.get("after", {})
+            taken.get("before", {}),
+            taken.get("during", []),
+            taken.get("after", {}),
+            device.get("slowdowns"),
         ),
+        unread=lambda: _unread(device.get("unread", {})),
     )
     yield from warnings.values()
+    loads = device.get("beside")
+    for load in loads if isinstance(loads, list) else ():
+        yield from gathered(left=lambda load=load: _left(load)).values()  # type: ignore[misc]
+
+
+def _unread(shares: Mapping[str, float]) -> str:
+    """Which sensors of power and clocks failed."""
+    parts = [f"{name} in {100 * share:.3g}% of its readings" for name, share in shares.items()]
+    return f"sensors failed: {'; '.join(parts)}" if parts else ""
+
+
+def _left(load: Mapping[str, Any]) -> str | None:
+    """Whether a program that was to run beside the tracker ended before it did."""
+    if load["exit"] is None:
+        return None
+    there = f"it was there for {load['sequences']} of {load['of_sequences']} sequences"
+    return f"{load['command']!r} ended by itself after {load['seconds']:.3g} s: {there}"
 
 
 def _beyond(timing: Mapping[str, Any]) -> str | None:

@@ -8,6 +8,7 @@ What users' own trackers call is here.
 """
 
 from lae_sim.trackers.onnx import onnx_session
+from lae_sim.trackers.protocol import box_of
 from lae_sim.trackers.stages import stage
 
-__all__ = ["onnx_session", "stage"]
+__all__ = ["box_of", "onnx_session", "stage"]

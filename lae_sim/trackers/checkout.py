@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import sys
 import types
 from collections.abc import Iterator, Sequence
@@ -13,7 +14,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from lae_sim.errors import LaeError, install
+from lae_sim.errors import LaeError, install, one_line
 from lae_sim.errors import explained as raised
 
 _PACKAGES = {
@@ -23,13 +24,16 @@ _PACKAGES = {
 }  # module -> what pip calls it
 
 
-def existing(path: str | Path, what: str, folder: bool = False) -> Path:
+def existing(path: str | os.PathLike[str], what: str, folder: bool = False) -> Path:
     """The absolute path of a file or folder that is there.
 
     Raises:
         LaeError: if it is not.
     """
-    absolute = Path(path).expanduser().resolve()
+    try:
+        absolute = Path(path).expanduser().resolve()
+    except (OSError, RuntimeError, TypeError, ValueError) as error:  # none, or a loop of links
+        raise LaeError(f"{path}: no path ({what}): {one_line(str(error))}") from error
     if not (absolute.is_dir() if folder else absolute.is_file()):
         raise LaeError(f"{absolute}: no such {'folder' if folder else 'file'} ({what})")
     return absolute

@@ -9,18 +9,24 @@ from lae_sim.errors import LaeError
 from lae_sim.plugins import bound, check_methods, imported
 from lae_sim.trackers.protocol import Tracker
 
-NAMES = "dcf, nanotrack, opencv:NAME, pysot, pytracking, trax:COMMAND, package.module:factory"
+NAMES = (
+    "dcf, nanotrack, opencv:NAME, pysot, pytracking, trax:COMMAND, vot:NAME, package.module:factory"
+)
 
-# name -> (module, class); what follows a colon is the first argument
+TIMEOUT_S = 30
+"""Seconds that a call of a tracker may take where nothing else is said."""
+
+# name -> (module, what makes one); what follows a colon is the first argument
 _BUILT_IN = {
     "dcf": ("dcf", "Dcf"),
     "nanotrack": ("nanotrack", "NanoTrack"),
     "opencv": ("opencv", "OpenCv"),
     "pysot": ("pysot", "PySot"),
     "pytracking": ("pytracking", "PyTracking"),
-    "trax": ("trax", "Trax"),
+    "trax": ("trax", "trax_program"),
+    "vot": ("trax", "vot_tracker"),
 }
-_TAKE_ARGUMENT = ("opencv", "trax")
+_TAKE_ARGUMENT = ("opencv", "trax", "vot")
 
 
 def make_tracker(name: str, options: Mapping[str, Any]) -> Tracker:
@@ -48,3 +54,20 @@ def make_tracker(name: str, options: Mapping[str, Any]) -> Tracker:
     tracker: Tracker = bound(f"tracker {name!r}", factory, positional, options)
     check_methods(f"tracker {name!r}", tracker, {"init": ("frame", "box"), "track": ("frame",)})
     return tracker
+
+
+def usual_timeout(name: str, options: Mapping[str, Any]) -> float:
+    """Seconds that a call may take: of a tracker of a VOT registry, what that says.
+
+    Args:
+        name, options: as of `make_tracker`.
+
+    Raises:
+        LaeError: if there is no such registry, or no such tracker in it.
+    """
+    kind, _, value = name.partition(":")
+    if kind != "vot" or not value:
+        return TIMEOUT_S
+    from lae_sim.trackers.trax import INI, find_entry
+
+    return find_entry(value, options.get("ini", INI)).timeout or TIMEOUT_S

@@ -14,10 +14,11 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
-from lae_sim.errors import LaeError, install, one_line
+from lae_sim.errors import LaeError, install, one_line, shown
 from lae_sim.trackers.checkout import existing
 from lae_sim.trackers.onnx_file import reshaped
 
@@ -25,6 +26,7 @@ _SUFFIX = "ExecutionProvider"
 _CPU, _CUDA, _TENSORRT = "CPU" + _SUFFIX, "CUDA" + _SUFFIX, "Tensorrt" + _SUFFIX
 _NO_FALLBACK = "session.disable_cpu_ep_fallback"
 _FOLDER = "session.model_external_initializers_file_folder_path"
+_MOST_THREADS = 1024  # ONNX Runtime starts as many as it is told to, whatever there is to run them
 _TYPES = {"float": "float32", "double": "float64"}  # where NumPy has another word
 
 
@@ -62,11 +64,18 @@ def onnx_session(
         shape.)
 
     Raises:
-        LaeError: if ONNX Runtime or the provider is not there, the file is none that it can run, or
-            nodes would run elsewhere.
+        LaeError: if ONNX Runtime or the provider is not there, the file is none that it can run,
+            nodes would run elsewhere, or an argument is none.
     """
+    if threads is not None and not (_is_whole(threads) and 1 <= threads <= _MOST_THREADS):
+        raise LaeError(f"threads: {shown(threads)} is not a whole number from 1 to {_MOST_THREADS}")
+    for name, sides in dict(shapes or {}).items():
+        if not (
+            isinstance(sides, Sequence) and all(_is_whole(side) and side > 0 for side in sides)
+        ):
+            raise LaeError(f"shapes: {shown(name)}: {shown(sides)} are not whole numbers from 1")
     ort = _onnxruntime()
-    file = existing(os.fspath(path), "an ONNX model")
+    file = existing(path, "an ONNX model")
     wanted = _provider(ort, provider)
     providers = _providers(wanted, device, cache, dict(options or {}))
     settings = ort.SessionOptions()
@@ -98,6 +107,10 @@ def onnx_session(
     return session
 
 
+def _is_whole(number: Any) -> bool:
+    return isinstance(number, Integral) and not isinstance(number, bool)
+
+
 def _onnxruntime() -> Any:
     try:
         import onnxruntime
@@ -112,14 +125,15 @@ def _onnxruntime() -> Any:
 def _provider(ort: Any, asked: str) -> str:
     """The full name of a provider that this build has."""
     there: list[str] = ort.get_available_providers()
+    wanted = str(asked).lower()
     for name in there:
-        if asked.lower() in (name.lower(), _short(name).lower()):
+        if wanted in (name.lower(), _short(name).lower()):
             return name
     hint = ""
-    if asked.lower() in ("cuda", "tensorrt"):
+    if wanted in ("cuda", "tensorrt"):
         hint = "; it is in onnxruntime-gpu, to be installed instead of onnxruntime"
     raise LaeError(
-        f"ONNX Runtime {ort.__version__} here has no provider {asked!r}, only "
+        f"ONNX Runtime {ort.__version__} here has no provider {shown(asked)}, only "
         f"{', '.join(map(_short, there))}{hint}"
     )
 

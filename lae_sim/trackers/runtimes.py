@@ -164,8 +164,11 @@ class Runtimes:
         held = [each for each in self._models if each[1]() is not None]
         self._models = [*held, (runtime, weakref.ref(model), threads)]
 
-    def _wrap(self, kind: Any, init: Callable[..., None]) -> None:
-        """Have objects of a class made by ``init(original, self, ...)``."""
+    def _wrap(self, module: Any, name: str, init: Callable[..., None]) -> None:
+        """Have objects of a module's class made by ``init(original, self, ...)``."""
+        kind = getattr(module, name, None)
+        if kind is None:  # another module, or a folder, that happens to be called so
+            return
         original = kind.__init__
 
         @functools.wraps(original)
@@ -195,7 +198,7 @@ class Runtimes:
                 threads = 1 + (_system_threads() or before) - before  # and the one that calls
             self._keep("onnxruntime", made, threads or None)
 
-        self._wrap(module.InferenceSession, session)
+        self._wrap(module, "InferenceSession", session)
 
     def _watch_openvino(self, module: Any) -> None:
         def core(original: Any, made: Any, *arguments: Any, **options: Any) -> None:
@@ -211,8 +214,8 @@ class Runtimes:
                 threads = made.get_property("INFERENCE_NUM_THREADS")
             self._keep("openvino", made, threads or None)
 
-        self._wrap(module.Core, core)
-        self._wrap(module.CompiledModel, compiled)
+        self._wrap(module, "Core", core)
+        self._wrap(module, "CompiledModel", compiled)
 
     def _watch_litert(self, module: Any) -> None:
         def interpreter(original: Any, made: Any, *arguments: Any, **options: Any) -> None:
@@ -222,7 +225,7 @@ class Runtimes:
             original(made, *arguments, **options)
             self._keep("litert", made, threads)
 
-        self._wrap(module.Interpreter, interpreter)
+        self._wrap(module, "Interpreter", interpreter)
 
 
 class _AfterImport(MetaPathFinder):
@@ -231,7 +234,7 @@ class _AfterImport(MetaPathFinder):
     def __init__(self, calls: dict[str, Callable[[Any], None]]) -> None:
         self._calls = calls
         for name, call in calls.items():
-            if name in sys.modules:
+            if sys.modules.get(name) is not None:
                 call(sys.modules[name])
         sys.meta_path.insert(0, self)
 
@@ -241,13 +244,15 @@ class _AfterImport(MetaPathFinder):
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         call = self._calls.get(fullname)
-        if call is None:
+        if call is None or self not in sys.meta_path:
             return None
-        for finder in sys.meta_path:
-            spec = finder.find_spec(fullname, path, target) if finder is not self else None
+        # those behind it, one of which may do the same: each asks only those behind itself
+        for finder in sys.meta_path[sys.meta_path.index(self) + 1 :]:
+            spec = finder.find_spec(fullname, path, target)
             if spec is not None:
                 loader: Any = spec.loader
-                loader.exec_module = functools.partial(_executed, loader.exec_module, call)
+                if loader is not None:  # as of a folder that happens to be called so
+                    loader.exec_module = functools.partial(_executed, loader.exec_module, call)
                 return spec
         return None
 

@@ -16,10 +16,13 @@ from contextvars import ContextVar
 from threading import get_ident
 from time import perf_counter_ns
 
-from lae_sim.errors import LaeError
+from lae_sim.errors import LaeError, shown
 
-STAGE_NAME = re.compile("[a-z][a-z0-9_]*")
+STAGE_NAME = re.compile("[a-z][a-z0-9_]{0,39}")
 """What a stage may be called."""
+
+MOST_STAGES = 100
+"""How many names a tracker may mark: each becomes a column of its trace."""
 
 
 def checked_stage(name: str) -> str:
@@ -30,8 +33,8 @@ def checked_stage(name: str) -> str:
     """
     if not isinstance(name, str) or not STAGE_NAME.fullmatch(name):
         raise LaeError(
-            f"{name!r:.80} is no name of a stage: small letters, digits and underscores, such as "
-            "'preprocess'"
+            f"{shown(name)} is no name of a stage: small letters, digits and underscores, 40 at "
+            "most, such as 'preprocess'"
         )
     return name
 
@@ -45,7 +48,8 @@ class stage:  # noqa: N801 - in a with statement it reads as contextlib's do
 
     Args:
         name: ``"preprocess"``, ``"inference"``, ``"postprocess"``, or your own: small letters,
-            digits and underscores. ``"decode"`` is what profile calls the reading of frames.
+            digits and underscores, 40 at most. ``"decode"`` is what profile calls the reading of
+            frames.
 
     Raises:
         LaeError: if a stage may not be called so.

@@ -14,7 +14,7 @@ from lae_sim.errors import LaeError, shown
 from lae_sim.trackers.names import make_tracker
 from lae_sim.trackers.protocol import Image
 from lae_sim.trackers.runtimes import Runtimes
-from lae_sim.trackers.stages import listening
+from lae_sim.trackers.stages import MOST_STAGES, listening
 
 LARGEST = 1e9
 """The largest number in a box, pixels: what lies beyond is no place in an image."""
@@ -64,6 +64,7 @@ class Stopwatch:
                 )
         self._sync: Callable[[], object] = getattr(self._tracker, "sync", _cuda_at_rest)
         self._started = False
+        self._stages: set[str] = set()
         self.sets_search = hasattr(self._tracker, "set_search")
         self._runtimes.limit()
 
@@ -127,6 +128,12 @@ class Stopwatch:
             output = call(*arguments)
             self._sync()
             elapsed_ns, cpu_ns = perf_counter_ns() - start, process_time_ns() - cpu
+        self._stages.update(marked.ns)
+        if len(self._stages) > MOST_STAGES:
+            raise LaeError(
+                f"marks more than {MOST_STAGES} stages, such as {min(marked.ns)!r} and "
+                f"{max(marked.ns)!r}: what every call does again has one name"
+            )
         return output, {"elapsed_ns": elapsed_ns, "cpu_ns": cpu_ns, "stages": marked.ns}
 
 

@@ -461,3 +461,77 @@ def test_a_file_of_flags_is_not_replaced(world, convert):
     paths = [str(world / "boxes"), "--truth", str(world / "LaSOT"), "--out", str(path)]
     assert main([*paths, "--time", "constant:1ms", "--force"]) == 2
     assert path.read_text() == FLAGS["full_occlusion"]
+
+
+LOG = """frame,arrived_ms,ready_ms,x,y,w,h
+0,0,40,10,20,30,40
+1,33,,,,,
+2,67,95.5,12,20,30,40
+"""
+
+
+def test_a_log_replays_by_the_policy_that_is_named_last(tmp_path, capsys):
+    (tmp_path / "flight.csv").write_text(LOG)
+    trace = tmp_path / "t.parquet"
+    assert main([str(tmp_path / "flight.csv"), "--fps", "30", "--out", str(trace)]) == 0
+    printed = capsys.readouterr().out
+    assert printed == (
+        f"{trace}: flight on flight, 1 sequences, 3 frames at 30 fps, in real time, 2 processed; "
+        "median 34.2 ms a frame. Read as csv; times: measured.\n"
+        "Note: the first output's time stands for that of the initialisation.\n"
+        "Note: no ground truth: a replay tells of ages and skipped frames, not of scores.\n"
+        f"Next: lae-sim replay {trace} --policy recorded\n"
+    )
+    assert replay_main([str(trace), "--policy", "recorded", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["traces"][0]["policy"] == "recorded"
+    assert found["traces"][0]["exact"]
+    assert replay_main([str(trace)]) == 2
+    assert "or the policy that it was recorded under" in capsys.readouterr().err
+    assert main([str(tmp_path / "flight.csv"), "--json", "--out", str(trace)]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["format"], summary["fps"]) == ("csv", "30.3")
+    assert len(summary["notes"]) == 2  # the rate's, and that there is no truth
+
+
+def test_a_log_is_not_overwritten(tmp_path, capsys):
+    path = tmp_path / "flight.csv"
+    path.write_text(LOG)
+    assert main([str(path), "--out", str(path), "--force"]) == 2
+    assert path.read_text() == LOG
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--time", "constant:47ms"], "--time is of results, and this is a log"),
+        (["--frame-times", "even"], "--frame-times is of results, and this is a log"),
+        (["--box-topic", "/box"], "boxes: of bags, and"),
+        (["--init-box", "1,2,3"], "'1,2,3' is not a box: write X,Y,W,H"),
+        (["--field", "x"], "'x' is not NAME=PATH, such as x=bbox.center.position.x"),
+        (["--clock-offset=soon", "--arrivals", "captured"], "line 2: no time when the frame was"),
+    ],
+)
+def test_options_that_are_not_of_this_log(tmp_path, capsys, options, message):
+    (tmp_path / "flight.csv").write_text(LOG)
+    trace = tmp_path / "t.parquet"
+    status = 0
+    try:
+        status = main([str(tmp_path / "flight.csv"), "--fps", "30", "--out", str(trace), *options])
+    except SystemExit as end:
+        status = end.code
+    assert status == 2
+    assert message in capsys.readouterr().err
+    assert not trace.exists()
+
+
+def test_options_of_logs_are_not_of_results(convert):
+    assert "--gaps is of logs, and these are results" in convert("KCF", "--gaps", "dropped")[2]
+
+
+def test_results_need_truth(world, capsys):
+    assert main([str(world / "KCF"), "--out", str(world / "t.parquet")]) == 2
+    assert "--truth: results need the dataset's folder" in capsys.readouterr().err
+    (world / "KCF" / "metadata.yaml").write_text("tracker: KCF")  # is no bag
+    assert main([str(world / "KCF"), "--out", str(world / "t.parquet")]) == 2
+    assert "--truth: results need" in capsys.readouterr().err

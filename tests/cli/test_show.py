@@ -326,6 +326,27 @@ def test_odd_figures_are_shown() -> None:
     assert "cpu        A; 2" in text
 
 
+_NUMBERS = st.dictionaries(TEXT, st.floats(allow_nan=False, allow_infinity=False))
+_ENERGY = {
+    "calls": st.integers(),
+    "seconds": st.floats(-1e300, 1e300),
+    "power_w": _NUMBERS,
+    "idle_w": _NUMBERS,
+    "total": st.lists(TEXT, max_size=2),
+}
+MEASURED = st.fixed_dictionaries(
+    {},
+    optional={
+        "energy": st.fixed_dictionaries(_ENERGY) | OBJECT,
+        "clocks": _NUMBERS | ANYTHING,
+        "slowdowns": _NUMBERS | ANYTHING,
+        "unread": _NUMBERS | ANYTHING,
+        "beside": st.lists(OBJECT, max_size=2) | ANYTHING,
+    },
+)
+"""What is measured of a device, or something else in its place."""
+
+
 @settings(max_examples=30)
 @given(
     st.fixed_dictionaries(
@@ -337,7 +358,7 @@ def test_odd_figures_are_shown() -> None:
             "failures": ANYTHING,
             "lae_sim": ANYTHING,
             "other": ANYTHING,
-            "device": OBJECT | st.fixed_dictionaries({"readings": ANYTHING | READINGS}),
+            "device": OBJECT | st.fixed_dictionaries({"readings": ANYTHING | READINGS}) | MEASURED,
             "sequences": st.fixed_dictionaries(
                 {"a": st.fixed_dictionaries({}, optional={"order": ANYTHING, "lost": ANYTHING})}
             ),

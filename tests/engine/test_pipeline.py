@@ -40,6 +40,14 @@ def test_stages_stand_in_any_order_if_they_say_what_they_come_after() -> None:
     assert pipeline.output == "publish"
 
 
+def test_what_it_is_made_of_is_its_own() -> None:
+    resources = {"gpu": 1}
+    made = Pipeline((stage for stage in [Stage("decode"), TRACKER]), resources=resources)
+    resources["gpu"] = 0
+    assert made == Pipeline([Stage("decode"), TRACKER], resources={"gpu": 1})
+    assert Pipeline(TRACKER) == Pipeline([TRACKER])  # type: ignore[arg-type]
+
+
 def test_the_tracker_may_be_called_otherwise() -> None:
     assert Pipeline([Stage("siam"), Stage("send")], tracker="siam").output == "send"
 
@@ -57,6 +65,9 @@ def test_the_tracker_may_be_called_otherwise() -> None:
         ({"priority": "high"}, "stage 'tracker': priority: 'high' is not a whole number"),
         ({"when_full": "drop_oldest"}, "did you mean 'drop-oldest'"),
         ({"when_full": []}, "stage 'tracker': when_full: no \\[\\]"),
+        ({"resource": ["gpu"]}, "stage 'tracker': resource: a name, not \\['gpu'\\]"),
+        ({"resource": ""}, "stage 'tracker': resource: a name, not ''"),
+        ({"after": ["camera"]}, "stage 'tracker': after: a name, not \\['camera'\\]"),
     ],
 )
 def test_a_stage_refuses(values: dict[str, Any], says: str) -> None:
@@ -74,7 +85,7 @@ def test_a_stage_refuses(values: dict[str, Any], says: str) -> None:
         ([Stage("tracker", after="tracker")], "stage 'tracker': after: a loop"),
         (
             [Stage("decode", after="tracker"), Stage("tracker", after="decode")],
-            "after: a loop: decode, tracker come after each other",
+            "after: a loop: none of decode, tracker comes after the camera",
         ),
         (
             [Stage("decode"), Stage("tracker", resource="gpu")],
@@ -86,6 +97,7 @@ def test_a_stage_refuses(values: dict[str, Any], says: str) -> None:
             "stage 'record': after: what comes after the tracker does not branch, and 'publish'",
         ),
         (["tracker"], "a pipeline has stages"),
+        (5, "a pipeline has stages"),
     ],
 )
 def test_a_pipeline_refuses(stages: Any, says: str) -> None:
@@ -98,8 +110,12 @@ def test_a_pipeline_refuses(stages: Any, says: str) -> None:
     ("values", "says"),
     [
         ({"resources": {"gpu": 0}}, "resources: gpu: 0 is not a whole number from 1"),
+        ({"resources": ["gpu"]}, "resources: whole numbers by name, not \\['gpu'\\]"),
         ({"camera": "fast"}, "camera: such as Camera"),
         ({"tracker": "siam"}, "no stage is called 'siam'"),
+        ({"tracker": ["siam"]}, "no stage is called \\['siam'\\]"),
+        ({"name": "drone\n"}, "name: 'drone.n' is no name of a pipeline"),
+        ({"name": 5}, "name: 5 is no name of a pipeline"),
     ],
 )
 def test_what_stands_beside_the_stages(values: dict[str, Any], says: str) -> None:
@@ -112,3 +128,9 @@ def test_what_stands_beside_the_stages(values: dict[str, Any], says: str) -> Non
 def test_a_camera_takes_durations(key: str, value: Any) -> None:
     with pytest.raises(LaeError, match=f"camera: {key}: .* is not a duration"):
         Camera(**{key: value})
+
+
+@pytest.mark.parametrize("drops", [5, True, {"every": 10}, None])
+def test_a_camera_loses_frames_that_are_listed(drops: Any) -> None:
+    with pytest.raises(LaeError, match=r"camera: drops: .* or a list of frames, not"):
+        Camera(drops=drops)

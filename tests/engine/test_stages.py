@@ -244,6 +244,19 @@ def test_a_full_queue_lets_the_initialisation_in() -> None:
     assert ms(scale.taken)[:3] == [101, 41, 161]
 
 
+def test_workers_without_end_are_as_many_as_there_are_frames() -> None:
+    stages = [Stage("decode", workers=10**18), Stage("tracker", queue=None)]
+    schedule = simulate_pipeline(Pipeline(stages), 4, CLOCK, constant(decode=100, tracker=1))
+    assert ms(schedule.stages["decode"].started) == [0, 40, 80, 120]
+
+
+def test_no_worker_of_the_tracker_begins_before_it_is_initialised() -> None:
+    services = {"tracker": lambda frame: (10 if frame else 90) * MS}
+    stages = [Stage("tracker", workers=2, queue=None)]
+    schedule = simulate_pipeline(Pipeline(stages), 4, CLOCK, services)
+    assert ms(schedule.start) == [0, 90, 90, 120]
+
+
 def test_two_trackers_on_one_gpu_take_turns() -> None:
     stages = [Stage(name, resource="gpu", after="camera") for name in ("tracker", "other")]
     pipeline = Pipeline(stages, resources={"gpu": 1})
@@ -271,19 +284,26 @@ def test_a_queue_of_ten_makes_everything_late(when_full: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("time", "error", "says"),
+    ("time", "says"),
     [
-        (-1, LaeError, "stage 'decode', frame 0: a time cannot be negative"),
-        (2**63, LaeError, "stage 'decode', frame 0: done at tick .* beyond 64 bits"),
-        (0.5, TypeError, "float"),
-        (None, TypeError, "NoneType"),
-        (float("inf"), TypeError, "float"),
+        (-1, "a time cannot be negative"),
+        (2**63, "done at tick .* beyond 64 bits"),
+        (0.5, "TypeError: 'float'"),
+        (None, "TypeError: 'NoneType'"),
+        (float("inf"), "TypeError: 'float'"),
     ],
 )
-def test_times_that_are_none(time: int, error: type[Exception], says: str) -> None:
+def test_times_that_are_none(time: int, says: str) -> None:
     services = {"decode": lambda frame: time, "tracker": lambda frame: 1}
-    with pytest.raises(error, match=says):
+    with pytest.raises(LaeError, match=f"stage 'decode', frame 0: {says}"):
         simulate_pipeline(Pipeline([Stage("decode"), Stage("tracker")]), 2, CLOCK, services)
+
+
+def test_what_a_service_raises_is_told_with_its_place() -> None:
+    times = iter([1])  # of one frame
+    services = {"tracker": lambda frame: next(times)}
+    with pytest.raises(LaeError, match=r"'tracker', frame 1: StopIteration \(.*test_stages\.py"):
+        simulate_pipeline(Pipeline([Stage("tracker")]), 2, CLOCK, services)
 
 
 def test_an_empty_sequence_and_a_negative_jitter() -> None:

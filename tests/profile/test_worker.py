@@ -239,6 +239,14 @@ def test_a_stage_that_no_trace_can_name_is_an_error(make: Callable[..., TimedTra
     tracker.close()
 
 
+def test_stages_without_number_are_an_error(make: Callable[..., TimedTracker]) -> None:
+    tracker = make("misbehaving:Numbered")
+    tracker.init(FRAME, BOX)
+    with pytest.raises(TrackerError, match="more than 100 stages, such as 'frame_0'"):
+        tracker.track(FRAME)
+    tracker.close()
+
+
 def test_a_tracker_without_set_search_cannot_be_told(make: Callable[..., TimedTracker]) -> None:
     tracker = make()
     tracker.init(FRAME, BOX)

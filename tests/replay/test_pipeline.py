@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import sys
+from dataclasses import fields, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from places import TRACES
 from witness import moving
 
@@ -135,12 +139,20 @@ def test_the_sample_is_one() -> None:
         ("stages = [{name = 'tracker'}, {name = 'tracker'}]", "stage 'tracker': name: two"),
         ("stages = [{name = 'tracker', after = 'tracker'}]", "stage 'tracker': after: a loop"),
         ("stages = [{name = 'tracker', resource = 'gpu'}]", "stage 'tracker': resource: no 'gpu'"),
-        ("resources = 3\nstages = [{name = 'tracker'}]", "resources: a table"),
+        ("resources = 3\nstages = [{name = 'tracker'}]", "resources: whole numbers by name"),
         ("camera = {delay = '3ms'}\nstages = [{name = 'tracker'}]", "camera: unknown key 'delay'"),
         ("camera = {jitter = 'recorded'}\nstages = [{name = 'tracker'}]", "camera: jitter: 'reco"),
         (
             "camera = {drops = 'some'}\nstages = [{name = 'tracker'}]",
             "camera: drops: 'some': write",
+        ),
+        (
+            f"stages = [{{name = 'tracker', time = 'uniform:0ms-8ms:{'9' * 5000}'}}]",
+            "stage 'tracker': time: SEED: .* is not a whole number",
+        ),
+        (
+            f"camera = {{drops = 'share:0.5:{'9' * 5000}'}}\nstages = [{{name = 'tracker'}}]",
+            "camera: drops: SEED: .* is not a whole number",
         ),
         ("camera = {drops = [-1]}\nstages = [{name = 'tracker'}]", "camera: drops: -1 is not"),
         ("stage = 3", "pipeline: unknown key 'stage'; did you mean 'stages'"),
@@ -158,6 +170,56 @@ def test_bad_files_are_named_with_the_stage_and_the_key(
     assert str(caught.value).count("\n") < 2
 
 
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=9), inner),
+    max_leaves=4,
+)
+WORDS = st.sampled_from(
+    ["tracker", "decode", "camera", "gpu", "block", "6ms", "uniform:1ms-2ms:1", "share:1/2:3"]
+    + ["every:9", "stage:decode", "recorded,init=1ms", ":", "os:path", "-1ms", "9" * 5000 + "ms"]
+)
+
+
+def tables(kind: type) -> st.SearchStrategy[Any]:
+    """Tables of a record's keys, with whatever values."""
+    values = {each.name: ANYTHING | WORDS for each in fields(kind)}
+    return st.fixed_dictionaries({}, optional=values)
+
+
+@settings(max_examples=60)
+@given(
+    tables(Pipeline),
+    st.lists(tables(Stage), max_size=3),
+    tables(Camera) | ANYTHING,
+    st.dictionaries(WORDS, st.integers(0, 2)) | ANYTHING,
+)
+def test_any_document_is_a_pipeline_or_refused(
+    document: dict[str, Any], stages: list[Any], camera: Any, resources: Any
+) -> None:
+    first = {"name": "tracker", "after": "camera"}
+    document = {**document, "stages": [first, *stages], "camera": camera, "resources": resources}
+    document["tracker"] = "tracker"
+    try:
+        pipeline = parse_pipeline(document)
+    except LaeError:
+        return
+    assert parse_pipeline(document) == pipeline
+    World.of(pipeline=pipeline)
+
+
+@pytest.mark.parametrize("time", ["6ms", "uniform:6ms-6ms:1", "constant:6ms", "stage:decode"])
+def test_every_time_may_tell_the_initialisation_apart(time: str) -> None:
+    recording = replace(moving(5), stages={"decode": np.full(5, 6 * MS)})
+    pipeline = Pipeline([Stage("decode", f"{time},init=90ms")], tracker="decode")
+    (run,) = replay_trace(trace_of(recording), pipeline=pipeline)
+    assert took_ms(run.schedule, "decode").tolist()[:3] == [90, 6, 6]
+    before = Pipeline([Stage("decode", f"{time},init=90ms"), Stage("tracker", "1ms")])
+    (run,) = replay_trace(trace_of(recording), pipeline=before)
+    assert took_ms(run.schedule, "decode").tolist()[:3] == [90, 6, 6]
+    assert World.of(pipeline=pipeline).label().endswith(",init=90ms")
+
+
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(LaeError, match="no such file"):
         read_pipeline(tmp_path / "drone.toml")
@@ -170,6 +232,30 @@ def test_a_stage_takes_what_was_recorded_for_it() -> None:
     done = run(TWO, recording).stages["decode"].finished >= 0
     expected = recording.stages["decode"][done] / MS
     assert took_ms(run(TWO, recording), "decode").tolist() == expected.tolist()
+
+
+def test_what_is_recorded_of_other_stages_is_no_part_of_the_tracker_s_time() -> None:
+    recording = staged(6)
+    whole = recording.elapsed_ns
+    for pipeline, parts in [
+        (TWO, ["decode"]),
+        (Pipeline([Stage("decode", "1ms"), Stage("tracker")]), ["decode"]),
+        (Pipeline([Stage("read", "stage:decode,init=9ms"), Stage("tracker")]), ["decode"]),
+        (Pipeline([Stage("read", "1ms"), Stage("tracker")]), []),
+        (Pipeline([Stage("tracker")]), []),
+    ]:
+        for latency in ("recorded", "resample:1"):
+            runs = replay_trace(trace_of(recording), pipeline=pipeline, latency=latency)
+            (found,) = runs
+            left = whole - sum(recording.stages[part] for part in parts)
+            schedule = found.schedule
+            took = (schedule.ready - schedule.start) // schedule.clock.ticks_per_ns
+            if latency == "recorded":
+                assert took.tolist() == left[schedule.frames].tolist()
+            else:
+                assert set(took.tolist()) <= set(left.tolist())
+    unknown = replace(recording, stages={"decode": np.full(6, -1)})
+    assert PipelineTimes.of(TWO).of_tracker(unknown).elapsed_ns.tolist() == whole.tolist()
 
 
 @pytest.mark.parametrize("time", ["recorded", "by-call", "bootstrap:1", "lognormal:1"])
@@ -188,10 +274,11 @@ def test_times_are_scaled_but_not_the_camera() -> None:
 
 
 def test_a_trace_without_the_stage_s_times_says_what_to_do() -> None:
-    with pytest.raises(
-        LaeError, match="'a, stage decode': the trace has no times of stage 'decode'"
-    ):
-        run(TWO, moving(5))
+    decode = Stage("decode", "stage:read+scale")
+    for stages, name in ((TWO.stages, "decode"), ([decode, Stage("tracker")], "read")):
+        says = f"sequence 'a': the trace has no times of stage '{name}': give .* 'decode' a time"
+        with pytest.raises(LaeError, match=says):
+            run(Pipeline(stages), moving(5))
 
 
 def test_streams_differ_from_stage_to_stage_and_from_sequence_to_sequence() -> None:
@@ -233,6 +320,7 @@ def test_the_world_s_latency_is_the_tracker_s() -> None:
     assert (world.label(), world.times_kind) == ("constant:47ms", "constant")
     assert replace(world, sigmas=(Fraction(1),)).label() == "constant:47ms"
     assert world.policy_label == "pipeline:own"
+    assert World.of(pipeline=own, latency="constant:47ms") == world
     with pytest.raises(
         LaeError, match="latency: constant:3ms, and the pipeline says constant:47ms"
     ):
@@ -299,10 +387,30 @@ def test_times_of_one_s_own_are_functions() -> None:
     endless = Pipeline(
         [Stage("decode", lambda recording: lambda frame: float("inf")), Stage("tracker")]
     )
-    with pytest.raises(LaeError, match="sequence 'a': pipeline: TypeError"):
+    with pytest.raises(LaeError, match="sequence 'a': stage 'decode', frame 0: TypeError"):
         list(replay_trace(trace_of(moving(5)), pipeline=endless))
     with pytest.raises(LaeError, match="stage 'decode': time: 3 is no time"):
         World.of(pipeline=Pipeline([Stage("decode", 3), Stage("tracker")]))  # type: ignore[arg-type]
+
+
+def test_plug_ins_are_made_once(tmp_path: Path) -> None:
+    (tmp_path / "made_once.py").write_text(
+        "made = []\n\nclass Mine:\n    def __init__(self, ms, more=0):\n"
+        "        self.ns = (ms + more) * 1_000_000\n        made.append(ms)\n\n"
+        "    def __call__(self, recording):\n        return lambda frame: self.ns\n"
+    )
+    (tmp_path / "drone.toml").write_text(
+        "camera = {jitter = 'made_once:Mine:ms=3'}\n"
+        "stages = [{name = 'decode', time = 'made_once:Mine:ms=6,more=1'},"
+        " {name = 'tracker', time = 'made_once:Mine:ms=40,init=90ms'}]\n"
+    )
+    trace = trace_of(moving(6))
+    worlds = World.sweep(pipeline=tmp_path / "drone.toml", scale=[1, 2])
+    (run,), (other,) = (world.replay(trace) for world in worlds)
+    assert sorted(sys.modules["made_once"].made) == [3, 6, 40]
+    assert took_ms(run.schedule, "decode").tolist()[:2] == [7, 7]
+    assert took_ms(other.schedule, "tracker").tolist()[:2] == [180, 80]
+    assert worlds[0].label() == "made_once:Mine:ms=40,init=90ms"
 
 
 def test_a_document_has_a_name_of_its_own() -> None:

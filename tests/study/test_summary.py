@@ -9,13 +9,27 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from places import REPOSITORY
+from schemas import check
 
 from lae_sim.comparison.statistics import Difference, Interval, Recovered
+from lae_sim.figures.study import ENERGY, front
 from lae_sim.replay.world import SIGMA_GRID
-from lae_sim.study.records import Failure, Modelled, Staleness, SummaryRow, Uncertainty
+from lae_sim.report.page import page_sections
+from lae_sim.report.study_tables import ranking, study_text
+from lae_sim.study.records import (
+    Consumption,
+    Failure,
+    Modelled,
+    Staleness,
+    SummaryRow,
+    Uncertainty,
+)
 from lae_sim.study.run import compute_study, write_csv
 from lae_sim.study.spec import Study
 from lae_sim.study.summary import _front, _median_survival
+from lae_sim.study.view import View
+from lae_sim.trace.file import Trace, read_trace, write_trace
+from lae_sim.trace.metadata import Metadata
 
 SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
 FAST = REPOSITORY / "traces" / "synthetic-fast.parquet"
@@ -189,3 +203,94 @@ def test_half_is_half_where_floats_would_miss_it():
     assert _median_survival(np.array([1.0, 2, 3]), np.array([True, False, False])) is None
     # censored before the failures: 1, then 1 - 1/2
     assert _median_survival(np.array([1.0, 2, 3]), np.array([False, True, False])) == 2
+
+
+def with_power(path, out, watts, idle=None, source="measured"):
+    """A trace whose device took so many watts during calls, and at rest."""
+    trace = read_trace(path)
+    energy = {"calls": 10, "seconds": 1.0, "power_w": {"VDD_IN": watts}, "total": ["VDD_IN"]}
+    energy |= {} if idle is None else {"idle_w": {"VDD_IN": idle}}
+    document = dict(trace.metadata.document)
+    document |= {"device": {"model": "board", "energy": energy}, "timing": {"source": source}}
+    write_trace(Trace(Metadata.of(document), list(trace)), out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """A study of two traces with power, and one without."""
+    folder = tmp_path_factory.mktemp("power")
+    traces = (
+        with_power(SLOW, folder / "slow.parquet", 20.0, 4.0),
+        with_power(FAST, folder / "fast.parquet", 5.0),
+        FAST,
+    )
+    study = Study(traces, scales=(Fraction(1), Fraction(2)), forecasters=("hold",))
+    return compute_study(study, folder / "results", workers=1)
+
+
+def test_the_energy_of_calls_is_told_where_their_power_was_measured(measured):
+    rows = {(row.trace, row.scale): row for row in measured.summary}
+    slow, fast = rows["slow", 1], rows["fast", 1]
+    assert slow.energy.joules_per_frame == pytest.approx(20 * slow.elapsed_ms / 1e3)
+    assert slow.energy.joules_above_idle == pytest.approx(16 * slow.elapsed_ms / 1e3)
+    per_second = 30 * (1 - slow.skip_rate)
+    assert slow.energy.watts == pytest.approx(4 + slow.energy.joules_above_idle * per_second)
+    assert 4 < slow.energy.watts <= 20.01  # it is busy nearly all of the time
+    flat = slow.flat()
+    assert flat["auc_per_watt"] == pytest.approx(slow.score("auc") / slow.energy.watts)
+    assert (fast.energy.joules_above_idle, fast.energy.watts) == (None, None)
+    assert fast.flat()["auc_per_watt"] is None
+    # times that are stretched are no device's whose power is known
+    assert rows["slow", 2].energy is None
+    assert rows["synthetic-fast", 1].energy is None
+    assert "joules_per_frame" not in rows["synthetic-fast", 1].flat()
+    check(measured.document(), "study")
+
+
+def test_the_front_of_energy_stands_beside_that_of_time(measured):
+    rows = {row.trace: row for row in measured.summary if row.scale == 1}
+    assert rows["fast"].energy.pareto
+    expected = rows["slow"].score("auc") > rows["fast"].score("auc")
+    assert rows["slow"].energy.pareto == expected
+    view = View(measured)
+    picture = front(view, ENERGY)
+    assert picture.caption.startswith("AUC against the energy of the device during a call")
+    assert picture.draw().axes[0].get_xlabel() == "energy of a call (J)"
+    titles = [section.title for section in page_sections(view)]
+    assert titles.index("Accuracy against energy") == titles.index("Accuracy against time") + 1
+    header = ranking(view).header
+    assert [name for name in header if name in ("J/frame", "W", "AUC/W", "energy front")] == [
+        "J/frame",
+        "W",
+        "AUC/W",
+        "energy front",
+    ]
+    assert "AUC/W" in study_text(measured, None)
+
+
+@pytest.mark.parametrize(
+    ("latency", "is_told"),
+    [("by-call", True), ("resample", True), ("constant:47ms", False), ("recorded,init=1s", True)],
+)
+def test_times_that_were_not_measured_have_no_energy(tmp_path, latency, is_told):
+    trace = with_power(FAST, tmp_path / "fast.parquet", 5.0, 4.0)
+    study = Study((trace,), latencies=(latency,), forecasters=("hold",))
+    (row,) = compute_study(study, tmp_path / "results", workers=1).summary
+    assert (row.energy is not None) == is_told
+
+
+def test_times_that_a_trace_does_not_call_measured_have_no_energy(tmp_path):
+    trace = with_power(FAST, tmp_path / "fast.parquet", 5.0, source="constant 47 ms, not measured")
+    study = Study((trace,), forecasters=("hold",))
+    (row,) = compute_study(study, tmp_path / "results", workers=1).summary
+    assert row.energy is None
+
+
+def test_rivals_are_ordered_by_energy_too():
+    def row(auc, joules):
+        spent = None if joules is None else Consumption(joules, None, None)
+        return summary_row(scores={"auc": auc, "dp20": None}, elapsed_ms=1.0, energy=spent)
+
+    rivals = [row(0.5, 2.0), row(0.6, 3.0), row(0.4, 2.5), row(0.9, None)]
+    assert _front(rivals, lambda each: each.energy and each.energy.joules_per_frame) == [0, 1]

@@ -73,6 +73,31 @@ def test_threads_are_set(ort, average):
     assert session.get_session_options().intra_op_num_threads == 3
 
 
+@pytest.mark.parametrize("threads", [0, -1, 10**6, 2.5, "2", True])
+def test_threads_are_a_number_that_a_machine_can_start(average, threads):
+    with pytest.raises(LaeError, match=r"threads: .* is not a whole number from 1 to"):
+        onnx_session(average, threads=threads)
+
+
+@pytest.mark.parametrize("sides", [5, "ab", (1, 3, -1, 9), (1, 3, 2.5, 9), (1, 3, None, 9)])
+def test_shapes_are_whole_numbers(average, sides):
+    with pytest.raises(LaeError, match=r"shapes: 'input': .* are not whole numbers from 1"):
+        onnx_session(average, shapes={"input": sides})
+
+
+@pytest.mark.parametrize("path", [None, 5, b"average.onnx", "average\0.onnx"])
+def test_what_is_no_path_is_said_to_be_none(ort, path):
+    with pytest.raises(LaeError, match=r"no path .an ONNX model"):
+        onnx_session(path)
+
+
+def test_a_link_to_itself_is_no_file(ort, tmp_path):
+    link = tmp_path / "loop.onnx"
+    link.symlink_to(link)
+    with pytest.raises(LaeError, match=r"loop\.onnx: no "):
+        onnx_session(link)
+
+
 def test_leaves_no_file_behind(ort, average, monkeypatch, tmp_path):
     here = tmp_path / "here"
     here.mkdir()
@@ -108,6 +133,8 @@ def test_without_onnx_runtime_the_extra_is_named(average, monkeypatch):
 def test_a_provider_that_is_not_there_is_refused(ort, average):
     with pytest.raises(LaeError, match=r"no provider 'Abacus', only .*CPU"):
         onnx_session(average, "Abacus")
+    with pytest.raises(LaeError, match=r"no provider None, only .*CPU"):
+        onnx_session(average, None)
     for provider in ("CUDA", "TensorRT"):
         if f"{provider.capitalize()}ExecutionProvider" in ort.get_available_providers():
             pytest.skip("this build has it")

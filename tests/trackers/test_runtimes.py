@@ -233,6 +233,27 @@ def test_a_module_is_still_found_and_can_be_looked_for(library: Any, watched: An
         importlib.import_module("openvino")
 
 
+def test_two_at_once_see_what_is_imported_then(library: Any, watched: Any) -> None:
+    library("tflite_runtime.interpreter", INTERPRETER)
+    first, second = watched(), watched(3)
+    made = importlib.import_module("tflite_runtime.interpreter").Interpreter("model")
+    assert made.num_threads == 3
+    assert len(first.models()) == len(second.models()) == 1
+
+
+def test_a_folder_or_another_module_may_be_called_so(
+    tmp_path: Path, library: Any, watched: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library("openvino", "def nothing(): ...")
+    library("tflite_runtime.other", "")
+    (tmp_path / "tflite_runtime" / "interpreter").mkdir()
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    watched(3)
+    for name in ("openvino", "tflite_runtime.interpreter"):
+        importlib.import_module(name)
+    assert watched(3).models() == []  # where they are imported already
+
+
 @pytest.mark.parametrize(
     ("module", "name"),
     [("ncnn", "ncnn"), ("MNN", "mnn"), ("cupy", "cupy"), ("tensorrt", "tensorrt"), ("jax", "jax")],

@@ -192,7 +192,9 @@ def test_any_nesting_adds_up_to_the_time_within_marks(tree: list[Any]) -> None:
     assert sum(call.ns.values()) == clock.now
 
 
-@pytest.mark.parametrize("name", ["", "Pre", "pre-process", "pre process", "1st", "é", "a+b", None])
+@pytest.mark.parametrize(
+    "name", ["", "Pre", "pre-process", "pre process", "1st", "é", "a+b", None, "a" * 41, "a\n"]
+)
 def test_a_stage_has_a_name(name: Any) -> None:
     with pytest.raises(LaeError, match=r"is no name of a stage: small letters.*'preprocess'"):
         stage(name)

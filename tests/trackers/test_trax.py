@@ -22,7 +22,7 @@ from lae_sim.trackers.names import make_tracker
 
 pytest.importorskip("trax", reason="TraX is not installed: pip install 'lae-sim[trax]'")
 
-from lae_sim.trackers.trax import FOLDER, Trax
+from lae_sim.trackers.trax import FOLDER, Trax, trax_program
 
 BOX = (10.5, 20.0, 30.0, 8.0)
 FRAME = np.zeros((60, 81, 3), np.uint8)
@@ -251,7 +251,7 @@ def test_a_wrapped_tracker_is_initialised_inside_init(started: Callable[..., Tra
 )
 def test_what_is_not_a_trax_tracker(command: str, message: str) -> None:
     with pytest.raises(LaeError, match=message) as caught:
-        Trax(command)
+        trax_program(command)
     assert "\n" not in str(caught.value)
 
 
@@ -259,7 +259,7 @@ def test_one_that_connects_and_says_nonsense(tmp_path: Path) -> None:
     program = "import os, socket; s = socket.create_connection(('127.0.0.1', "
     program += "int(os.environ['TRAX_SOCKET']))); s.send(b'hello\\n'); print('bye')"
     with pytest.raises(LaeError, match=r"ended with status 0 \(Unable to connect.*: bye$"):
-        Trax(shlex.join([sys.executable, "-c", program]))
+        trax_program(shlex.join([sys.executable, "-c", program]))
 
 
 def test_close_leaves_nothing(started: Callable[..., Trax]) -> None:
@@ -280,8 +280,8 @@ def test_what_a_killed_process_left_is_removed(
     command: Callable[[str], str], started: Callable[..., Trax]
 ) -> None:
     program = (
-        "import os, signal, sys; from lae_sim.trackers.trax import Trax\n"
-        "tracker = Trax(sys.argv[1]); print(tracker._folder.name, flush=True)\n"
+        "import os, signal, sys; from lae_sim.trackers.trax import trax_program\n"
+        "tracker = trax_program(sys.argv[1]); print(tracker._folder.name, flush=True)\n"
         "print(tracker._process.pid, flush=True)\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
@@ -317,4 +317,4 @@ def test_the_watchdog_ends_a_hanging_one_with_its_program(command: Callable[[str
 def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "trax", None)
     with pytest.raises(LaeError, match=r"pip install 'lae-sim\[trax\]'"):
-        Trax("true")
+        trax_program("true")
