@@ -8,7 +8,7 @@ SimPy moves the clock. See Li et al., "Predictive Visual Tracking" (2021), Eqs. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from operator import index, itemgetter
@@ -126,6 +126,11 @@ class Schedules:
     def __iter__(self) -> Iterator[Schedule]:
         """Each, in order."""
         return map(self.__getitem__, range(len(self)))
+
+    @property
+    def kinds(self) -> Collection[Clock]:
+        """The clocks, each object once: to hash those of many lanes takes long."""
+        return dict(zip(map(id, self.clocks), self.clocks)).values()
 
     @property
     def visible(self) -> Ints:

@@ -20,7 +20,7 @@ from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention, is_scored
 from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_scores
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scored, Scorer
-from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
+from lae_sim.forecast.base import AnyFactory, Hold, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run, RunBatch, distinct, grouped, regrouped
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes, Metadata
@@ -550,6 +550,12 @@ class _Scoring:
         which, scored = known.which(runs), []
         for name, factory in self.forecasters.items():
             pairing = pairings[self.costs.get(name, 0)]
+            if factory is Hold and name not in map(itemgetter(0), self.observed):
+                of_runs = runs.table, runs.row, runs.own
+                held = known.scorer.held(which, pairing, *of_runs, self.curves_at)
+                if held is not None:
+                    scored.append(held)
+                    continue
             parts = _answers(runs, self.image_sizes, pairing, name, factory)
             parts = self._observed(parts, pairing, name, kept)
             scored.append(known.scorer.of(which, parts, len(self.sigmas), self.curves_at))
@@ -627,8 +633,8 @@ def _replay_statistics(
     firsts = schedules.offsets[:-1]
     elapsed = (schedules.ready - schedules.start) // schedules.clocks[0].ticks_per_ns
     init_ns = elapsed[firsts]
-    rates = np.full(len(elapsed), np.inf)
-    np.divide(1e9, elapsed, out=rates, where=elapsed > 0)
+    with np.errstate(divide="ignore"):
+        rates = 1e9 / elapsed  # infinite where a call took 0
     # zeros in place of initialisations: what is summed up are the other calls, in their order
     elapsed[firsts], rates[firsts] = 0, 0.0
     return ReplayStatistics(
@@ -709,7 +715,7 @@ def lanes_of(
     """
     numbers = pairing.frames.take(fed.output)
     frames = pairing.frame_times(np.repeat(fed.sequence, np.diff(fed.offsets)), numbers)
-    fed_boxes = runs.boxes.take(fed.output, axis=0)
+    fed_boxes = runs.table.take(runs.row.take(fed.output), axis=0)
     recordings, which = runs.distinct
     first = np.full((len(recordings), 2), np.inf)
     resized: dict[int, ImageSizes] = {}
