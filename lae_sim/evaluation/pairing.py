@@ -98,12 +98,10 @@ class Pairing:
             np.concatenate([[0], np.cumsum(sizes)]),
             self.frames.take(outputs),
             None if self.steps is None else self.steps.take(outputs),
-            None if self.next_steps is None else self.next_steps.take(outputs),
             self.scale,
             self.sigmas,
-            self.first.take(outputs, axis=0),
-            self.end.take(outputs, axis=0),
             tuple(self.clocks[s] for s in which.tolist()),
+            None if self.arrived is None else self.arrived.take(outputs, axis=0),
         )
 
     @cached_property

@@ -200,11 +200,13 @@ class RunBatch:
         return RunBatch(
             tuple(self.recordings[r] for r in which.tolist()),
             Schedules.of([self.schedules[r] for r in which.tolist()]),
-            np.concatenate(boxes),
+            table := np.concatenate(boxes),
+            np.arange(len(table)),
             self.departures[which],
             self.disagreement[which],
             (None,) * len(which),
             self.repetition[which],
+            np.zeros(len(which), np.bool_),
         )
 
     @classmethod
