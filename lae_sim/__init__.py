@@ -60,6 +60,6 @@ The names of this package are imported from their modules when they are first us
 
 from lae_sim._faces import lazy_face
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __getattr__, __dir__ = lazy_face(__name__, __file__)

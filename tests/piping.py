@@ -64,6 +64,7 @@ class Passage:
     finished: Fraction | None = NOT_YET
     left: Fraction | None = NOT_YET
     dropped: str = ""
+    gone: Fraction | None = NOT_YET
 
 
 @dataclass
@@ -113,7 +114,9 @@ class Witness:
                 pass
         for place, state in enumerate(self.states):
             for frame in [*state.waiting, *(frame for frame, _ in state.held_up)]:
-                self.log[place][frame].dropped = "END"
+                passage = self.log[place][frame]
+                passage.dropped = "END"
+                passage.gone = max(self.end, passage.arrived or self.end)
 
     def plan(self, when: Fraction, place: int, frame: int) -> None:
         self.order += 1
@@ -202,6 +205,7 @@ class Witness:
         state.passages[frame].arrived = self.now
         if why := self.refused(place, frame):
             state.passages[frame].dropped = why
+            state.passages[frame].gone = self.now
             return
         state.waiting = sorted([*state.waiting, frame])
         queue = state.stage.queue
@@ -211,6 +215,7 @@ class Witness:
         victim = droppable[0] if state.stage.when_full == "drop-oldest" else droppable[-1]
         state.waiting.remove(victim)
         state.passages[victim].dropped = "FULL"
+        state.passages[victim].gone = self.now
 
     def take(self, place: int, state: _State) -> None:
         frame = state.waiting.pop(0)
@@ -232,6 +237,7 @@ class Witness:
         state = self.states[place]
         if self.is_over(place, frame):
             state.passages[frame].dropped = "END"
+            state.passages[frame].gone = self.now
             state.idle += 1
             assert state.stage.resource is not None
             self.returning.append(state.stage.resource)

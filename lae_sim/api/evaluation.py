@@ -200,8 +200,7 @@ class Evaluated:
             document["pipeline"] = self.pipeline.report()
             delays = {float(s): self.pipeline.answer_delay_ms(s) for s in world.sigmas}
             for result in document["results"]:  # LAE's age knows no camera
-                result["capture_age_ms"] = result["age_ms"]
-                result["age_ms"] -= delays[result["sigma"]]
+                result["capture_age_ms"] = result["age_ms"] + delays[result["sigma"]]
         return document
 
 
@@ -426,6 +425,14 @@ class EvaluationResult:
         """Success and precision of all traces, or of a sweep how AUC and DP change over it."""
         return plot_evaluations(self.parts)
 
+    def plot_waterfall(self) -> Figure:
+        """Where the time goes in pipelines, from a frame's capture to its answer.
+
+        Raises:
+            LaeError: if none was replayed, or none has answered a frame.
+        """
+        return plot_waterfalls(self.parts)
+
     def write(self, folder: str | os.PathLike[str]) -> None:
         """Write what a paper needs: figures and tables (see :mod:`lae_sim.report.paper`).
 
@@ -617,6 +624,48 @@ def plot_evaluations(parts: Sequence[Evaluated], sigma: Fraction | None = None) 
     return success_and_precision(plotted.curves(parts), plotted.setting)
 
 
+def plot_waterfalls(parts: Sequence[Evaluated]) -> Figure:
+    """Where the time goes in pipelines, from a frame's capture to its answer, a panel for each.
+
+    Args:
+        parts: of one or several traces, in one world or several.
+
+    Raises:
+        LaeError: if none was replayed through a pipeline, or none of its frames was answered.
+    """
+    from lae_sim.figures.pipeline import waterfall_figure
+
+    return waterfall_figure(*_waterfalls(parts))
+
+
+_TOLD = {"fps": "{:g} fps", "scale": "times x {:g}"}
+
+
+def _waterfalls(parts: Sequence[Evaluated]) -> tuple[list[dict[str, Any]], list[str]]:
+    """The documents of pipelines that have answered, and a name for each."""
+    reports, settings = [], []
+    for part in parts:
+        if part.pipeline is not None and part.pipeline.outputs:
+            reports.append(part.document())
+            settings.append({**_setting(part.scenario), "policy": part.pipeline.pipeline.name})
+    if not reports:
+        raise LaeError("nothing to draw a waterfall of: no pipeline has answered a frame")
+    several = len({setting["policy"] for setting in settings})
+    telling = [
+        name
+        for name in ("trace", "latency", "fps", "scale")
+        if len({(setting["policy"], setting[name]) for setting in settings}) > several
+    ]
+    names = [
+        ", ".join([
+            setting["policy"],
+            *(_TOLD.get(name, "{}").format(setting[name]) for name in telling),
+        ])
+        for setting in settings
+    ]  # fmt: skip
+    return reports, names
+
+
 def _metric(panel: Panel) -> str:
     """The metric of a panel, as files are named."""
     return panel.ylabel.lower().replace(" at 20 px", "20")
@@ -625,7 +674,7 @@ def _metric(panel: Panel) -> str:
 def figures_for_paper(
     parts: Sequence[Evaluated], sigma: Fraction | None = None
 ) -> Iterator[ColumnFigure]:
-    """The same in the style of a paper, one by one; then scores over sigma, and a timeline.
+    """The same in the style of a paper; then scores over sigma, waterfalls, and a timeline.
 
     The timeline is of the first sequence of the first trace, if its policy scores latency.
     """
@@ -659,6 +708,10 @@ def figures_for_paper(
                     f"{panel.ylabel} over the {panel.xlabel}; {part.scenario.label}",
                     partial(panel_in_column, panel),
                 )
+    if any(part.pipeline is not None and part.pipeline.outputs for part in parts):
+        from lae_sim.figures.pipeline import waterfalls_for_paper
+
+        yield from waterfalls_for_paper(*_waterfalls(parts))
     first = parts[0].scenario
     if scores_latency(first.world.rule()) and not any(first.costs.values()):
         yield timeline_for_paper(next(iter(first.runs)), plotted.at)

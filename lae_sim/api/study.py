@@ -20,7 +20,7 @@ from lae_sim.plugins import looking_in
 from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.names import named
 from lae_sim.report.page import page_drawings, page_of, page_sections
-from lae_sim.report.paper import Paper, remove_paper, write_paper, written_before
+from lae_sim.report.paper import Paper, Records, remove_paper, write_paper, written_before
 from lae_sim.report.study_tables import paper_tables
 from lae_sim.study.executors import RunAll, run_here
 from lae_sim.study.run import StudyResults, check_inputs, compute_study
@@ -145,9 +145,10 @@ def write_views(
     jobs: list[Callable[[], Any]] = [partial(drawn, figure) for figure in figures]
     jobs += pictures.values()
     with _being_done(jobs, run) as done:
-        tables, frames = paper_tables(view), {"scores": view.results.scores_frame()}
+        tables = paper_tables(view)
         made = done()
     count = len(figures)
+    frames = {"scores": Records(results.score_names(), results.score_rows)}
     write_paper(Paper(made[:count], tables, frames), results.folder)
     with written_whole(page) as temporary:
         text = page_of(view, sections, dict(zip(pictures, made[count:])))

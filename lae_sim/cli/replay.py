@@ -46,6 +46,7 @@ examples:
   lae-sim replay trace.parquet --latency constant:47ms,init=800ms --strided trace.gaps.parquet
   lae-sim replay trace.parquet --latency constant:47ms --search c=0.7 --pre-forecaster kalman
   lae-sim replay trace.parquet --pipeline drone.toml          from the camera to the command
+  lae-sim replay trace.parquet --pipeline one.toml ten.toml --waterfall why.png
   lae-sim replay a.parquet b.parquet --latency-scale 2 --json | jq '.traces[].results[].auc'
   lae-sim replay a.parquet b.parquet --sigma-grid --out paper       figures and tables in a folder
   lae-sim replay trace.parquet --forecaster my_package.my_module:MyForecaster --per-sequence
@@ -149,6 +150,11 @@ def parser() -> argparse.ArgumentParser:
         help="write what a paper needs: figures as PDF and SVG, tables as LaTeX, CSV and Parquet",
     )
     add("--plot", metavar="FILE", help="draw success and precision, or a sweep (.png, .svg, .pdf)")
+    add(
+        "--waterfall",
+        metavar="FILE",
+        help="draw where the time goes in pipelines, from capture to answer (.png, .svg, .pdf)",
+    )
     return made
 
 
@@ -159,7 +165,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _replay(arguments: argparse.Namespace) -> None:
-    from lae_sim.api.evaluation import EvaluationResult, plot_evaluations, scenario_bar, scenarios
+    from lae_sim.api.evaluation import (
+        EvaluationResult,
+        plot_evaluations,
+        plot_waterfalls,
+        scenario_bar,
+        scenarios,
+    )
     from lae_sim.engine.scheduler import scores_latency
     from lae_sim.replay.world import SIGMA_GRID
     from lae_sim.trace.file import read_trace
@@ -195,10 +207,12 @@ def _replay(arguments: argparse.Namespace) -> None:
         dataset=arguments.dataset,
         camera_lag=arguments.camera_lag,
     )
-    if arguments.plot:
+    pictures = {arguments.plot, arguments.waterfall} - {None}
+    if pictures:
         from lae_sim.figures.style import check_format
 
-        check_format(arguments.plot)
+        for picture in pictures:
+            check_format(picture)
     observed = list(product(arguments.forecaster, arguments.sigma))
     with ExitStack() as files, scenario_bar(asked) as advance:  # a failure leaves no file behind
         scored = tuple(
@@ -212,10 +226,12 @@ def _replay(arguments: argparse.Namespace) -> None:
             )
             for scenario in asked
         )
-        if arguments.plot:
+        if pictures:
             from lae_sim.figures.style import save
-
+        if arguments.plot:
             save(plot_evaluations(scored, arguments.sigma[0]), arguments.plot)
+        if arguments.waterfall:
+            save(plot_waterfalls(scored), arguments.waterfall)
     result = EvaluationResult(scored)
     if arguments.out is not None:
         result.write(arguments.out)
@@ -239,7 +255,10 @@ def _check_files(arguments: argparse.Namespace, swept: Sequence[str]) -> None:
         )
     if arguments.strided and len(arguments.traces) > 1:
         raise LaeError("--strided goes with one trace at a time")
-    outputs = [*(getattr(arguments, name) for name in _FILES), arguments.plot, arguments.out]
+    if arguments.waterfall and not arguments.pipeline:
+        raise LaeError("--waterfall is of the stages of a --pipeline")
+    pictures = [arguments.plot, arguments.waterfall]
+    outputs = [*(getattr(arguments, name) for name in _FILES), *pictures, arguments.out]
     check_outputs(arguments, outputs, arguments.traces)
     if arguments.out is not None:
         check_folder(arguments.out)

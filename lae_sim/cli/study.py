@@ -31,6 +31,8 @@ conventions are crossed:
   timing = ["jetson.parquet"]     other devices' times, for traces of their tracker and dataset
   forecasters = ["hold", "kalman"]       as in compare
   policies = ["latest"]                  as in replay
+  [pipelines]                            besides these, each a table or a file, as --pipeline in
+  drone = "drone.toml"                   replay; at the end of the file
   fps = ["trace", 60]                    world frame rates; "trace" is each trace's own
   forget_arrivals = false                whether frames arrive evenly also where a trace says when
                                          each of them did

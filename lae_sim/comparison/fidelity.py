@@ -23,7 +23,7 @@ from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.names import parse_policy
 from lae_sim.replay.run import Run, Runs
 from lae_sim.replay.search import SearchModel, find_search
-from lae_sim.trace.file import Trace, held, read_trace
+from lae_sim.trace.file import Trace, read_held, read_trace
 from lae_sim.trace.restarts import RestartName
 
 REPEATED_WITHIN = 0.02
@@ -267,8 +267,8 @@ def _with_passes(paths: Sequence[str], passes: Sequence[str]) -> list[_Replayed]
     Raises:
         LaeError: if a trace is of another kind, or a pass goes with none.
     """
-    replayed = [_Replayed(path, held(read_trace(path))) for path in paths]
-    opened = [(path, held(read_trace(path))) for path in passes]
+    replayed = [_Replayed(path, read_held(path)) for path in paths]
+    opened = [(path, read_held(path)) for path in passes]
     for each in replayed:
         if each.trace.metadata.kind == "restarts":
             raise LaeError(f"{each.path}: a gap pass goes to --strided, beside TRACE")

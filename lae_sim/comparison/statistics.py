@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ KEYS = ["attribute", "trace", "latency", "scale", "sigma", "forecaster", "metric
 RESAMPLES = 10_000
 _ROWS = 200  # resamples at once, at least
 _AT_ONCE = 1 << 16  # counts
+_FEW = 256  # sequences, whose counts are kept
 _NOISE_DECIMALS = 12  # equal differences of scores in 0..1 are equal to this many decimals
 
 
@@ -104,12 +106,8 @@ class Bootstrap:
     def counts(self, count: int) -> Counts:
         """How often each sequence is in each resample, uint16 [resamples, count] (or wider)."""
         if count not in self._counts:
-            generator = np.random.Generator(np.random.PCG64(self.seed))
-            counts = np.empty((self.resamples, count), np.uint16 if count < 2**16 else np.uint32)
-            for row in range(0, self.resamples, _ROWS):  # the same stream, without a large array
-                some = counts[row : row + _ROWS]
-                some[:] = generator.multinomial(count, np.full(count, 1 / count), size=len(some))
-            self._counts[count] = counts
+            drawn = _drawn_again if count <= _FEW else _drawn
+            self._counts[count] = drawn(self.resamples, self.seed, count)
         return self._counts[count]
 
     def means(self, values: Floats) -> Floats:
@@ -168,6 +166,20 @@ class Bootstrap:
         return Recovered(recovered(won, lost), shares)
 
 
+def _drawn(resamples: int, seed: int, count: int) -> Counts:
+    """Those of :meth:`Bootstrap.counts`."""
+    generator = np.random.Generator(np.random.PCG64(seed))
+    counts = np.empty((resamples, count), np.uint16 if count < 2**16 else np.uint32)
+    for row in range(0, resamples, _ROWS):  # the same stream, without a large array
+        some = counts[row : row + _ROWS]
+        some[:] = generator.multinomial(count, np.full(count, 1 / count), size=len(some))
+    return counts
+
+
+_drawn_again = lru_cache(4)(_drawn)
+"""The same, if they were drawn before for another :class:`Bootstrap`; nobody changes them."""
+
+
 def spread(values: Floats) -> tuple[float, float]:
     """About where the means of values, float64 [S], are in resamples: their mean and deviation."""
     return float(values.mean()), float(values.std()) / math.sqrt(len(values))
@@ -187,22 +199,22 @@ def quantiles(
     low, high = math.floor(places[0]), math.floor(places[1])
     if middle is None:
         middle, spread = float(values.mean()), float(values.std())
-    # some of the lowest and of the highest are most often enough, and sorting these is fast
-    lowest = values[values < middle - _tail(at[0]) * spread]
-    highest = values[values > middle + _tail(1 - at[1]) * spread]
-    left_out = len(values) - len(highest)
+    # some of the lowest and of the highest are most often enough
+    lowest = values.compress(values < middle - _tail(at[0]) * spread)
+    highest = values.compress(values > middle + _tail(1 - at[1]) * spread)
+    left_out, last = len(values) - len(highest), len(values) - 1
     if low + 1 < len(lowest) and high >= left_out:
-        lowest.sort()
-        highest.sort()
+        lowest.partition((low, low + 1))
+        highest.partition((high - left_out, min(high + 1, last) - left_out))
     else:
         lowest = highest = np.sort(values)
         left_out = 0
-    last = len(values) - 1
     lower = _between(lowest[low], lowest[min(low + 1, last)], places[0] - low)
     upper = highest[high - left_out], highest[min(high + 1, last) - left_out]
     return lower, _between(*upper, places[1] - high)
 
 
+@lru_cache(16)
 def _tail(share: float) -> float:
     """Beyond how many standard deviations twice so large a share of normal values lies."""
     return NormalDist().inv_cdf(1 - min(2 * share, 0.5)) if share > 0 else 0.0

@@ -244,6 +244,16 @@ class Pipeline:
         """The stage whose results are the pipeline's answers: the last after the tracker."""
         return self.below[-1] if self.below else self.tracker
 
+    @property
+    def way(self) -> tuple[Stage, ...]:
+        """The stages that an answer has passed, from the camera to the output."""
+        by_name = {stage.name: stage for stage in self.stages}
+        found, last = [], self.output
+        while last != CAMERA:
+            found.append(by_name[last])
+            last = by_name[last].after or CAMERA
+        return tuple(reversed(found))
+
     def __repr__(self) -> str:
         return f"<Pipeline {self.name!r}: {' > '.join([CAMERA, *(s.name for s in self.stages)])}>"
 

@@ -8,7 +8,7 @@ SimPy moves the clock. See Li et al., "Predictive Visual Tracking" (2021), Eqs. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from operator import index, itemgetter
@@ -63,6 +63,8 @@ class Schedule:
         visible: from when each output answers queries, int64 [n], ticks, never decreasing;
             ``NEVER`` for one that never does. None: from when it is ready. Stages after a tracker
             make it later (see :class:`.stages.PipelineSchedule`).
+        delivered: when each world frame reached the first stage, int64 [T], ticks; -1 where none
+            did. None: as it was captured.
     """
 
     clock: Clock
@@ -72,6 +74,7 @@ class Schedule:
     ready: Ints
     scores_latency: bool = True
     visible: Ints | None = None
+    delivered: Ints | None = None
 
     def __repr__(self) -> str:
         processed = f"{len(self.frames):,} of {self.length:,} frames processed"
@@ -123,6 +126,11 @@ class Schedules:
     def __iter__(self) -> Iterator[Schedule]:
         """Each, in order."""
         return map(self.__getitem__, range(len(self)))
+
+    @property
+    def kinds(self) -> Collection[Clock]:
+        """The clocks, each object once: to hash those of many lanes takes long."""
+        return dict(zip(map(id, self.clocks), self.clocks)).values()
 
     @property
     def visible(self) -> Ints:

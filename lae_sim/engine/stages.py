@@ -68,6 +68,7 @@ class StageLog:
         finished: when it was done, int64 [T], ticks.
         left: when the worker had handed it on, and was free again, int64 [T], ticks.
         dropped: why it was dropped, :class:`Drop`, int64 [T]; 0 if it was not.
+        gone: when it was dropped, int64 [T], ticks; at the end of the stream, if it still waits.
     """
 
     arrived: Ints
@@ -76,6 +77,7 @@ class StageLog:
     finished: Ints
     left: Ints
     dropped: Ints
+    gone: Ints
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -86,8 +88,8 @@ class PipelineSchedule(Schedule):
 
     Attributes:
         pipeline: what was run.
-        delivered: when each frame reached the first stages, int64 [T], ticks; -1 where the camera
-            lost it. They are captured at ``clock.arrival(frame)``.
+        delivered: see :class:`.scheduler.Schedule`; -1 for frames that the camera lost. They are
+            captured at ``clock.arrival(frame)``.
         stages: by name, in the pipeline's order.
     """
 
@@ -254,6 +256,7 @@ class _Work:
         self.arrived: list[float] = [-1] * length
         self.taken, self.started = self.arrived.copy(), self.arrived.copy()
         self.finished, self.left = self.arrived.copy(), self.arrived.copy()
+        self.gone = self.arrived.copy()
         self.dropped = [0] * length
 
     def offer(self, frame: int) -> simpy.Event | None:
@@ -275,7 +278,7 @@ class _Work:
     def _enter(self, frame: int) -> None:
         self.arrived[frame] = self.environment.now
         if refusal := self._refusal(frame):
-            self.dropped[frame] = refusal
+            self._drop(frame, refusal)
             return
         waiting, queue = self.waiting, self.stage.queue
         if not waiting or frame > waiting[-1]:
@@ -289,8 +292,11 @@ class _Work:
                 oldest = int(waiting[0] == 0)
                 loser = waiting[oldest]
                 del waiting[oldest]
-            self.dropped[loser] = Drop.FULL
+            self._drop(loser, Drop.FULL)
         self._let_take()
+
+    def _drop(self, frame: int, why: Drop) -> None:
+        self.dropped[frame], self.gone[frame] = why, self.environment.now
 
     def _refusal(self, frame: int) -> Drop:
         """Why a frame would not even be let in."""
@@ -340,7 +346,7 @@ class _Work:
                 holding = resource.request(self.stage.priority)
                 yield holding
             if self._over(frame):
-                self.dropped[frame] = Drop.END
+                self._drop(frame, Drop.END)
             else:
                 self.started[frame] = environment.now
                 ns = _time(f"stage {self.stage.name!r}", self.service, frame)
@@ -366,6 +372,7 @@ class _Work:
         """Say of frames that still wait why they never began."""
         for frame in (*self.waiting, *(frame for frame, _ in self.blocked)):
             self.dropped[frame] = Drop.END
+            self.gone[frame] = max(self.end or 0, self.arrived[frame])
 
     def log(self) -> StageLog:
         """What happened."""
@@ -377,6 +384,7 @@ class _Work:
                 np.array(self.finished, np.int64),
                 np.array(self.left, np.int64),
                 np.array(self.dropped, np.int64),
+                np.array(self.gone, np.int64),
             )
         except OverflowError as error:
             late = max(range(len(self.finished)), key=self.finished.__getitem__)

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
-from itertools import groupby, islice
+from itertools import groupby
 from operator import itemgetter
 from typing import Any, TypeAlias, TypeVar
 
@@ -14,12 +14,13 @@ import numpy as np
 
 from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import search_distance
+from lae_sim.engine.scheduler import Schedules
 from lae_sim.errors import LaeError, explained, shown
 from lae_sim.evaluation.metrics import METRICS, PYSOT, Convention, is_scored
 from lae_sim.evaluation.modelled import MODELLED, ModelledScores, modelled_scores
 from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, histories, pair, pairs
 from lae_sim.evaluation.scoring import Scored, Scorer
-from lae_sim.forecast.base import AnyFactory, Lanes, SequenceFactory, defines, forecast
+from lae_sim.forecast.base import AnyFactory, Hold, Lanes, SequenceFactory, defines, forecast
 from lae_sim.replay.run import Run, RunBatch, distinct, grouped, regrouped
 from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import ImageSizes, Metadata
@@ -112,7 +113,8 @@ class Staleness:
         mismatch_sum, mismatch_max: over the world frames, frames, int64 [S, M].
         longest_hold: most queries in a row with one answering output, frames, int64 [S, M].
         age_sum, age_max, longest_stale: the same in time, by when frames arrive, in nominal frame
-            intervals, float64 [S, M]; the permitted latency is not in it.
+            intervals, float64 [S, M]; the permitted latency is not in it, nor what a pipeline's
+            camera takes to deliver a frame.
     """
 
     mismatch_sum: Ints
@@ -123,9 +125,13 @@ class Staleness:
     longest_stale: Floats
 
     @classmethod
-    def of(cls, pairing: Pairing) -> Staleness:
-        """That of paired outputs and queries."""
-        return cls(*(getattr(pairing, field.name) for field in fields(cls)))
+    def of(cls, pairing: Pairing, schedules: Schedules) -> Staleness:
+        """That of paired outputs and queries, and of their schedules."""
+        found = cls(*(getattr(pairing, field.name) for field in fields(cls)))
+        for s, schedule in enumerate(schedules.whole or ()):
+            if schedule.delivered is not None:
+                found.age_sum[s], found.age_max[s] = pairing.ages_from(s, schedule.delivered)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -505,7 +511,7 @@ class _Scoring:
             for observer in self.observers:
                 observer(one)
         replay = _replay_statistics(runs, offline, which)
-        staleness = Staleness.of(pairings[0])
+        staleness = Staleness.of(pairings[0], runs.schedules)
         failure_time = np.where(failure < 0, -1.0, failed_at)
         curves, offline_curves = (
             Curves(
@@ -515,7 +521,7 @@ class _Scoring:
             for some in (scored, offline)
         )
         offline_scores = np.array([each.scores for each in offline])
-        outcomes = self._outcomes(runs, known, scores)
+        outcomes = self._outcomes(runs, pairings, known, scores)
         end = 0
         for part in parts:
             begin, end = end, end + len(part)
@@ -544,31 +550,45 @@ class _Scoring:
         which, scored = known.which(runs), []
         for name, factory in self.forecasters.items():
             pairing = pairings[self.costs.get(name, 0)]
+            if factory is Hold and name not in map(itemgetter(0), self.observed):
+                of_runs = runs.table, runs.row, runs.own
+                held = known.scorer.held(which, pairing, *of_runs, self.curves_at)
+                if held is not None:
+                    scored.append(held)
+                    continue
             parts = _answers(runs, self.image_sizes, pairing, name, factory)
             parts = self._observed(parts, pairing, name, kept)
             scored.append(known.scorer.of(which, parts, len(self.sigmas), self.curves_at))
         return scored
 
     def _outcomes(
-        self, runs: RunBatch, known: _Known, recorded: Mapping[str, Floats]
+        self,
+        runs: RunBatch,
+        pairings: Mapping[int, Pairing],
+        known: _Known,
+        recorded: Mapping[str, Floats],
     ) -> list[dict[str, Floats]]:
-        """The scores of the search model's outcomes (see :func:`.modelled.modelled_scores`)."""
+        """The scores of the search model's outcomes (see :func:`.modelled.modelled_scores`).
+
+        They are of the runs' schedules, so that they are paired with queries as the runs are.
+        """
         scores: list[dict[str, Floats]] = [{} for _ in runs.modelled]
-        others = []
+        others: list[tuple[int, int]] = []  # that are not as recorded
+        offsets = runs.schedules.offsets.tolist()
         for s, outcomes in enumerate(runs.modelled):
             if outcomes is None:
                 continue
-            run, boxes = runs[s], outcomes.boxes
+            boxes, own = outcomes.boxes, runs.boxes[offsets[s] : offsets[s + 1]]
             scores[s] = {m: np.stack([recorded[m][:, s]] * len(boxes), 1) for m in MODELLED}
-            for r, each in enumerate(boxes):
-                if not np.array_equal(each, run.boxes):
-                    others.append((s, r, replace(run, boxes=each)))
-        costs = {self.costs.get(name, 0) for name in self.forecasters}
-        unobserved, places = replace(self, observed=()), iter(others)
-        for group in grouped([run for *_, run in others], GROUP_FRAMES):
-            pairings = {cost: pair(group.schedules, self.sigmas, cost) for cost in costs}
-            scored = unobserved._scored(group, pairings, known, [])
-            for i, (s, r, _) in enumerate(islice(places, len(group))):
+            others += [(s, r) for r, each in enumerate(boxes) if not np.array_equal(each, own)]
+        unobserved = replace(self, observed=())
+        for some in _filled(others, runs.schedules.lengths, GROUP_FRAMES):
+            which = np.array([s for s, _ in some])
+            answered = [outcome.boxes[r] for s, r in some if (outcome := runs.modelled[s])]
+            own_pairings = {cost: each.of_sequences(which) for cost, each in pairings.items()}
+            group = runs.answering(which, answered)
+            scored = unobserved._scored(group, own_pairings, known, [])
+            for i, (s, r) in enumerate(some):
                 for metric in MODELLED:
                     scores[s][metric][:, r] = [each.scores[metric][i] for each in scored]
         return scores
@@ -589,6 +609,22 @@ class _Scoring:
             yield part
 
 
+def _filled(
+    outcomes: Iterable[tuple[int, int]], lengths: Ints, frames: int
+) -> Iterator[list[tuple[int, int]]]:
+    """Outcomes of sequences, which come first, in groups of about so many world frames."""
+    group: list[tuple[int, int]] = []
+    pending = 0
+    for each in outcomes:
+        group.append(each)
+        pending += int(lengths[each[0]]) + BESIDE
+        if pending >= frames:
+            yield group
+            group, pending = [], 0
+    if group:
+        yield group
+
+
 def _replay_statistics(
     runs: RunBatch, offline: Sequence[_Offline], which: Ints
 ) -> ReplayStatistics:
@@ -597,8 +633,8 @@ def _replay_statistics(
     firsts = schedules.offsets[:-1]
     elapsed = (schedules.ready - schedules.start) // schedules.clocks[0].ticks_per_ns
     init_ns = elapsed[firsts]
-    rates = np.full(len(elapsed), np.inf)
-    np.divide(1e9, elapsed, out=rates, where=elapsed > 0)
+    with np.errstate(divide="ignore"):
+        rates = 1e9 / elapsed  # infinite where a call took 0
     # zeros in place of initialisations: what is summed up are the other calls, in their order
     elapsed[firsts], rates[firsts] = 0, 0.0
     return ReplayStatistics(
@@ -679,7 +715,7 @@ def lanes_of(
     """
     numbers = pairing.frames.take(fed.output)
     frames = pairing.frame_times(np.repeat(fed.sequence, np.diff(fed.offsets)), numbers)
-    fed_boxes = runs.boxes.take(fed.output, axis=0)
+    fed_boxes = runs.table.take(runs.row.take(fed.output), axis=0)
     recordings, which = runs.distinct
     first = np.full((len(recordings), 2), np.inf)
     resized: dict[int, ImageSizes] = {}

@@ -16,6 +16,25 @@ _AT_ONCE = 256  # pairs whose boxes stay in the first cache
 
 
 @kernel
+def _quotient(value: int, divisor: int, inverse: float) -> int:
+    """``value // divisor``: a division of integers takes as long as all that is around it.
+
+    Args:
+        value: a whole number.
+        divisor: above zero.
+        inverse: 1 / divisor.
+    """
+    if divisor == 1:
+        return value
+    quotient = int(value * inverse)  # off by one, or by a few where it has more than 52 bits
+    while quotient * divisor > value:
+        quotient -= 1
+    while value - quotient * divisor >= divisor:
+        quotient += 1
+    return quotient
+
+
+@kernel
 def first_steps(ready: Ints, interval: int, scale: int, steps: Ints) -> None:
     """The step from which each output is visible: ceil(scale * ready / interval).
 
@@ -25,10 +44,11 @@ def first_steps(ready: Ints, interval: int, scale: int, steps: Ints) -> None:
         scale: see :class:`.pairing.Pairing`.
         steps: written, int64 [n].
     """
+    inverse = 1.0 / interval
     for o in range(len(ready)):
-        frame = ready[o] // interval
+        frame = _quotient(ready[o], interval, inverse)
         late = ready[o] - frame * interval
-        steps[o] = frame * scale - (-late * scale // interval)
+        steps[o] = frame * scale - _quotient(-late * scale, interval, inverse)
 
 
 @kernel
@@ -49,10 +69,11 @@ def first_visible(
         whole, part: the permitted latencies in whole frames, and the steps beyond, int64 [M].
         first, end: see :class:`.pairing.Pairing`: written, int32 [n, M].
     """
+    inverse = 1.0 / scale
     for s in range(len(lengths)):
         length = lengths[s]
         for o in range(offsets[s], offsets[s + 1]):
-            frame = steps[o] // scale
+            frame = _quotient(steps[o], scale, inverse)
             rest = steps[o] - frame * scale
             for m in range(len(whole)):
                 since = min(max(frame - whole[m] + (rest > part[m]), 0), length)
@@ -64,10 +85,13 @@ def first_visible(
 
 @kernel
 def sum_gaps(
+    lengths: Ints,
     offsets: Ints,
     frames: Ints,
-    first: Frames,
-    end: Frames,
+    steps: Ints,
+    scale: int,
+    whole: Ints,
+    part: Ints,
     source_sum: Ints,
     mismatch: Ints,
     hold: Ints,
@@ -75,20 +99,32 @@ def sum_gaps(
     """Sums and largest distances of frames in each sequence at each permitted latency.
 
     Args:
-        offsets, frames, first, end: see :class:`.pairing.Pairing`.
+        lengths, offsets, frames, steps, scale: see :class:`.pairing.Pairing`.
+        whole, part: see :func:`first_visible`.
         source_sum, mismatch, hold: see :class:`.pairing._Gaps`: written, int64 [S, M].
     """
     source_sum[:] = 0
     mismatch[:] = 0
     hold[:] = 0
-    for s in range(len(offsets) - 1):
+    inverse = 1.0 / scale
+    first = np.empty(len(whole), np.int64)
+    for s in range(len(lengths)):
+        length = lengths[s]
+        first[:] = 0
         for o in range(offsets[s], offsets[s + 1]):
-            frame = frames[o]
-            for m in range(first.shape[1]):
-                answered = end[o, m] - first[o, m]
-                source_sum[s, m] += answered * frame
-                mismatch[s, m] = max(mismatch[s, m], end[o, m] - frame - 1)
+            is_last = o + 1 == offsets[s + 1]
+            following = 0 if is_last else steps[o + 1]
+            frame = _quotient(following, scale, inverse)
+            rest = following - frame * scale
+            for m in range(len(whole)):
+                end = length
+                if not is_last:
+                    end = min(max(frame - whole[m] + (rest > part[m]), 0), length)
+                answered = end - first[m]
+                source_sum[s, m] += answered * frames[o]
+                mismatch[s, m] = max(mismatch[s, m], end - frames[o] - 1)
                 hold[s, m] = max(hold[s, m], answered)
+                first[m] = end
 
 
 @kernel
@@ -150,6 +186,14 @@ def most_pairs(
 
 
 @kernel
+def _place(sigmas: Ints, value: int) -> int:
+    """How many sigmas are below a value; where they are dense it may be out of range."""
+    if sigmas[-1] - sigmas[0] == len(sigmas) - 1:
+        return value - int(sigmas[0])
+    return int(np.searchsorted(sigmas, value))
+
+
+@kernel
 def list_pairs(
     offsets: Ints,
     output: Ints,
@@ -174,8 +218,6 @@ def list_pairs(
         How many there are.
     """
     items, frames, froms, tos = pairs[0], pairs[1], pairs[2], pairs[3]
-    count = len(sigmas)
-    dense = sigmas[-1] - sigmas[0] == count - 1
     n = 0
     for h in range(len(offsets) - 1):
         low, high = sigma_from[h], sigma_to[h]
@@ -185,12 +227,7 @@ def list_pairs(
                 from_, to = low, high
                 if high - low > 1:
                     since, until = steps[o] - scale * frame, next_steps[o] - scale * frame
-                    if dense:
-                        since, until = since - sigmas[0], until - sigmas[0]
-                    else:
-                        since = np.searchsorted(sigmas, since)
-                        until = np.searchsorted(sigmas, until)
-                    from_, to = max(since, low), min(until, high)
+                    from_, to = max(_place(sigmas, since), low), min(_place(sigmas, until), high)
                 if from_ < to:
                     items[n], frames[n], froms[n], tos[n] = item, frame, from_, to
                     n += 1
@@ -220,7 +257,7 @@ def _measure(
     leaves_out: bool,
     by_centre: bool,
     steps: int,
-    worth: Floats,
+    worth: Frames,
 ) -> None:
     """What pairs count, in a loop that compilers turn to vector instructions.
 
@@ -228,13 +265,16 @@ def _measure(
         truth, boxes: columns, float64 [4, ...].
         count: how many pairs.
         valid, leaves_out, by_centre, steps: see :func:`count_pairs`.
-        worth: success, precision and norm of :class:`.metrics.FrameCounts`, and 1 for ``norm_dp``,
-            with 2 more for ``apart``: written, float64 [4, ...].
+        worth: written, int32 [...], none of them 0::
+
+            bit   24      23     22  21         15        8           0
+                   1 | apart | norm_dp | norm (6) | precision (6) | success (9)
+
+            They are those of :class:`.metrics.FrameCounts`.
     """
     # by rows, which the compiler can see not to overlap
     x_, y_, w_, h_ = truth[0], truth[1], truth[2], truth[3]
     x1_, y1_, w1_, h1_ = boxes[0], boxes[1], boxes[2], boxes[3]
-    success, precision, norm, flags = worth[0], worth[1], worth[2], worth[3]
     missed = np.inf if leaves_out else -1.0
     for k in range(count):
         x, y, w, h = x_[k], y_[k], w_[k], h_[k]
@@ -260,11 +300,12 @@ def _measure(
         norm_error = _within(norm_error if counts_centre else missed, 1.0)
         above = _below(norm_error, 100)
 
-        success[k] = _below(shared, steps)
-        precision[k] = 51.0 - np.ceil(error)
-        norm[k] = 51.0 - (above if above < 51.0 else 51.0)
-        apart = counts & (shared == 0)
-        flags[k] = (1.0 if norm_error <= 0.20 else 0.0) + (2.0 if apart else 0.0)
+        # whole numbers in a float, so that only one is converted
+        packed = 2.0**23 if counts & (shared == 0) else 0.0
+        packed += 2.0**22 if norm_error <= 0.20 else 0.0
+        packed += (51.0 - (above if above < 51.0 else 51.0)) * 2.0**15
+        packed += (51.0 - np.ceil(error)) * 2.0**9
+        worth[k] = np.int32(packed + _below(shared, steps) + 2.0**24)
 
 
 @kernel
@@ -276,6 +317,63 @@ def _add(
     sums[s, m, 2] += norm_dp20
     sums[s, m, 3] += norm_auc
     sums[s, m, 4] += within50
+
+
+@kernel
+def _tally(
+    worth: Frames,
+    sequence: Ints,
+    frame: Ints,
+    sigma_from: Ints,
+    sigma_to: Ints,
+    curves_at: int,
+    sums: Ints,
+    success: Ints,
+    precision: Ints,
+    failure: Ints,
+) -> None:
+    """Add what some pairs count; see :func:`_measure` and :func:`count_pairs`."""
+    s = low = high = 0
+    shown = False
+    auc = dp20 = norm_dp20 = norm_auc = within50 = 0  # of pairs in a row of the same sigmas
+    for k in range(len(sequence)):
+        if sequence[k] != s or sigma_from[k] != low or sigma_to[k] != high:
+            _add(sums, s, low, auc, dp20, norm_dp20, norm_auc, within50)
+            _add(sums, s, high, -auc, -dp20, -norm_dp20, -norm_auc, -within50)
+            auc = dp20 = norm_dp20 = norm_auc = within50 = 0
+            s, low, high = sequence[k], sigma_from[k], sigma_to[k]
+            shown = low <= curves_at < high
+        packed = int(worth[k])
+        passed, within = packed & 511, packed >> 9 & 63
+        auc += passed
+        dp20 += within > 30
+        norm_dp20 += packed >> 22 & 1
+        norm_auc += packed >> 15 & 63
+        within50 += within > 0
+        if shown:
+            success[s, passed] += 1
+            precision[s, within] += 1
+        if packed >> 23 & 1:
+            for m in range(low, high):
+                failure[s, m] = min(failure[s, m], frame[k])
+    _add(sums, s, low, auc, dp20, norm_dp20, norm_auc, within50)
+    _add(sums, s, high, -auc, -dp20, -norm_dp20, -norm_auc, -within50)
+
+
+@kernel
+def _gather(
+    truth: Floats,
+    at: int,
+    answer: Floats,
+    is_truth: bool,
+    known: Floats,
+    answered: Floats,
+    k: int,
+) -> None:
+    """Put a pair's truth and answer, or the truth as such, in column k of two tables."""
+    for i in range(4):
+        known[i, k] = truth[i, at]
+        answered[i, k] = truth[i, at] if is_truth else answer[i]
 
 
 @kernel
@@ -312,41 +410,150 @@ def count_pairs(
         sums, success, precision, failure: see :class:`.scoring._Tally`.
     """
     known, answered = np.empty((4, _AT_ONCE)), np.empty((4, _AT_ONCE))
-    worth = np.empty((4, _AT_ONCE))
-    s = low = high = 0
-    shown = False
-    auc = dp20 = norm_dp20 = norm_auc = within50 = 0  # of pairs in a row of the same sigmas
+    worth = np.empty(_AT_ONCE, np.int32)
     for begin in range(0, len(frame), _AT_ONCE):
-        count = min(_AT_ONCE, len(frame) - begin)
-        for k in range(count):
-            p = begin + k
+        end = min(begin + _AT_ONCE, len(frame))
+        for p in range(begin, end):
             at = bases[sequence[p]] + frame[p]
-            known[0, k], known[1, k] = truth[0, at], truth[1, at]
-            known[2, k], known[3, k] = truth[2, at], truth[3, at]
-            answered[0, k], answered[1, k] = boxes[p, 0], boxes[p, 1]
-            answered[2, k], answered[3, k] = boxes[p, 2], boxes[p, 3]
-            if first_frame_is_truth and frame[p] == 0:
-                answered[:, k] = known[:, k]
-        _measure(known, answered, count, valid, leaves_out, by_centre, steps, worth)
-        for k in range(count):
-            p = begin + k
-            if sequence[p] != s or sigma_from[p] != low or sigma_to[p] != high:
-                _add(sums, s, low, auc, dp20, norm_dp20, norm_auc, within50)
-                _add(sums, s, high, -auc, -dp20, -norm_dp20, -norm_auc, -within50)
-                auc = dp20 = norm_dp20 = norm_auc = within50 = 0
-                s, low, high = sequence[p], sigma_from[p], sigma_to[p]
-                shown = low <= curves_at < high
-            passed, within, flags = int(worth[0, k]), int(worth[1, k]), int(worth[3, k])
-            auc += passed
-            dp20 += within > 30
-            norm_dp20 += flags & 1
-            norm_auc += int(worth[2, k])
-            within50 += within > 0
-            if shown:
-                success[s, passed] += 1
-                precision[s, within] += 1
-            if flags > 1:
-                for m in range(low, high):
-                    failure[s, m] = min(failure[s, m], frame[p])
-    _add(sums, s, low, auc, dp20, norm_dp20, norm_auc, within50)
-    _add(sums, s, high, -auc, -dp20, -norm_dp20, -norm_auc, -within50)
+            is_truth = first_frame_is_truth and frame[p] == 0
+            _gather(truth, at, boxes[p], is_truth, known, answered, p - begin)
+        _measure(known, answered, end - begin, valid, leaves_out, by_centre, steps, worth)
+        _tally(
+            worth,
+            sequence[begin:end],
+            frame[begin:end],
+            sigma_from[begin:end],
+            sigma_to[begin:end],
+            curves_at,
+            sums,
+            success,
+            precision,
+            failure,
+        )
+
+
+@kernel
+def _learn(
+    fresh: Frames,
+    new: Ints,
+    lags: Ints,
+    bases: Ints,
+    sequence: Ints,
+    frame: Ints,
+    worth: Frames,
+    found: Frames,
+) -> None:
+    """Put what is measured of some pairs in its places; see :func:`count_held`."""
+    for u in range(len(new)):
+        k = new[u]
+        worth[k] = fresh[u]
+        if lags[u] >= 0:
+            found[bases[sequence[k]] + frame[k], lags[u]] = fresh[u]
+
+
+@kernel
+def count_held(
+    bases: Ints,
+    truth: Floats,
+    lengths: Ints,
+    offsets: Ints,
+    frames: Ints,
+    own_steps: Ints,
+    scale: int,
+    sigmas: Ints,
+    table: Floats,
+    row: Ints,
+    own: Bools,
+    found: Frames,
+    valid: int,
+    leaves_out: bool,
+    by_centre: bool,
+    first_frame_is_truth: bool,
+    steps: int,
+    curves_at: int,
+    sums: Ints,
+    success: Ints,
+    precision: Ints,
+    failure: Ints,
+) -> None:
+    """The same for pairs with the latest output of a history of all outputs, none of them listed.
+
+    Args:
+        bases, truth, and all from ``valid`` on: see :func:`count_pairs`.
+        lengths, offsets, frames, own_steps, scale, sigmas: see :class:`.pairing.Pairing`.
+        table, row: boxes, float64 [N, 4], and the row of each output's, int64 [n].
+        own: whether a sequence's boxes are those of the recording that its truth is of, bool [S].
+        found: what the box of the frame 0, 1, 2, ... frames before counts, of such a recording, 0
+            where that is not known yet: read and written, int32 [..., lags].
+    """
+    known, answered = np.empty((4, _AT_ONCE)), np.empty((4, _AT_ONCE))
+    worth, fresh = np.empty((2, _AT_ONCE), np.int32)
+    block = np.empty((6, _AT_ONCE), np.int64)
+    sequence, frame, sigma_from, sigma_to, new, lags = block
+    count, most = len(sigmas), found.shape[1]
+    inverse = 1.0 / scale
+    n = unknown = 0
+    for s in range(len(lengths)):
+        length, base, last = lengths[s], bases[s], offsets[s + 1] - 1
+        begin = 0
+        for o in range(offsets[s], last + 1):
+            end = following = length
+            if o < last:
+                step = own_steps[o + 1]
+                end = min(max(-_quotient(sigmas[0] - step, scale, inverse), 0), length)
+                following = end
+                if count > 1:
+                    following = -_quotient(sigmas[-1] - step, scale, inverse)
+                    following = min(max(following, 0), length)
+            for i in range(begin, end):
+                low, high = 0, count
+                if count > 1:
+                    if o > offsets[s]:
+                        low = max(_place(sigmas, own_steps[o] - scale * i), 0)
+                    if o < last:
+                        high = min(_place(sigmas, own_steps[o + 1] - scale * i), count)
+                    if low >= high:
+                        continue
+                lag = i - frames[o]
+                if not (own[s] and 0 <= lag < most):
+                    lag = -1
+                packed = found[base + i, lag] if lag >= 0 else 0
+                worth[n] = packed
+                sequence[n], frame[n], sigma_from[n], sigma_to[n] = s, i, low, high
+                if packed == 0:
+                    is_truth = first_frame_is_truth and i == 0
+                    _gather(truth, base + i, table[row[o]], is_truth, known, answered, unknown)
+                    new[unknown], lags[unknown] = n, lag
+                    unknown += 1
+                n += 1
+                if n == _AT_ONCE:
+                    _measure(known, answered, unknown, valid, leaves_out, by_centre, steps, fresh)
+                    _learn(fresh, new[:unknown], lags, bases, sequence, frame, worth, found)
+                    _tally(
+                        worth,
+                        sequence,
+                        frame,
+                        sigma_from,
+                        sigma_to,
+                        curves_at,
+                        sums,
+                        success,
+                        precision,
+                        failure,
+                    )
+                    n = unknown = 0
+            begin = following
+    _measure(known, answered, unknown, valid, leaves_out, by_centre, steps, fresh)
+    _learn(fresh, new[:unknown], lags, bases, sequence, frame, worth, found)
+    _tally(
+        worth,
+        sequence[:n],
+        frame[:n],
+        sigma_from[:n],
+        sigma_to[:n],
+        curves_at,
+        sums,
+        success,
+        precision,
+        failure,
+    )

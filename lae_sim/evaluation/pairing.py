@@ -59,25 +59,20 @@ class Pairing:
         steps: step from which each output is visible, int64 [n]; hugely negative for the first
             of a sequence, since the initial box is always there. None where frames of some sequence
             arrive at times of their own.
-        next_steps: step of the output after it, int64 [n]; huge for the last of a sequence.
         scale: b, steps per frame.
         sigmas: m for each permitted latency m/b, ascending, int64 [M].
-        first: first world frame that each output answers, int32 [n, M].
-        end: the frame after the last one it answers, int32 [n, M]; equal to ``first`` if it
-            answers none.
         clocks: of each sequence, S of them.
+        arrived: what ``first`` is where there are no steps.
     """
 
     lengths: Ints
     offsets: Ints
     frames: Ints
     steps: Ints | None
-    next_steps: Ints | None
     scale: int
     sigmas: Ints
-    first: Frames
-    end: Frames
     clocks: tuple[Clock, ...]
+    arrived: Frames | None = None
 
     def chosen(self, sequence: int, sigma: int) -> Pairing:
         """That of one sequence at one of the permitted latencies, by their indices."""
@@ -88,13 +83,53 @@ class Pairing:
             self.offsets[sequence : sequence + 2] - self.offsets[sequence],
             self.frames[outputs],
             None if self.steps is None else self.steps[outputs],
-            None if self.next_steps is None else self.next_steps[outputs],
             self.scale,
             self.sigmas[sigmas],
-            self.first[outputs, sigmas],
-            self.end[outputs, sigmas],
             self.clocks[sequence : sequence + 1],
+            None if self.arrived is None else self.arrived[outputs, sigmas],
         )
+
+    def of_sequences(self, which: Ints) -> Pairing:
+        """That of some sequences, by their indices, perhaps of one several times."""
+        sizes = np.diff(self.offsets)[which]
+        outputs = ranges(self.offsets[which], sizes)
+        return Pairing(
+            self.lengths[which],
+            np.concatenate([[0], np.cumsum(sizes)]),
+            self.frames.take(outputs),
+            None if self.steps is None else self.steps.take(outputs),
+            self.scale,
+            self.sigmas,
+            tuple(self.clocks[s] for s in which.tolist()),
+            None if self.arrived is None else self.arrived.take(outputs, axis=0),
+        )
+
+    @cached_property
+    def next_steps(self) -> Ints | None:
+        """Step of the output after each, int64 [n]; huge for the last of a sequence."""
+        if self.steps is None:
+            return None
+        following = np.append(self.steps[1:], _NEVER)
+        following[self.offsets[1:] - 1] = _NEVER
+        return following
+
+    @property
+    def first(self) -> Frames:
+        """First world frame that each output answers, int32 [n, M]."""
+        return self._answered[0]
+
+    @property
+    def end(self) -> Frames:
+        """The frame after the last one it answers, int32 [n, M]; ``first`` if it answers none."""
+        return self._answered[1]
+
+    @cached_property
+    def _answered(self) -> tuple[Frames, Frames]:
+        if self.steps is not None:
+            grid = self.sigmas, self.scale
+            return _first_visible(self.steps, *grid, self.offsets, self.lengths)
+        assert self.arrived is not None, "without steps"
+        return self.arrived, _ends(self.arrived, self.offsets, self.lengths)
 
     @cached_property
     def mismatch_sum(self) -> Ints:
@@ -114,11 +149,12 @@ class Pairing:
     @cached_property
     def _gaps(self) -> _Gaps:
         gaps = _Gaps(*np.empty((3, len(self.lengths), len(self.sigmas)), np.int64))
-        if compiled():
+        if self.steps is not None and compiled():
             from lae_sim.evaluation import kernels
 
-            outputs = self.offsets, self.frames, self.first, self.end
-            kernels.sum_gaps(*outputs, gaps.source_sum, gaps.mismatch, gaps.hold)
+            outputs = self.lengths, self.offsets, self.frames, self.steps
+            grid = self.scale, *np.divmod(self.sigmas, self.scale)
+            kernels.sum_gaps(*outputs, *grid, gaps.source_sum, gaps.mismatch, gaps.hold)
         elif len(self.sigmas) < _WIDE:
             answered = self.end - self.first
             begins = self.offsets[:-1]
@@ -170,6 +206,28 @@ class Pairing:
 
         return self._longest(self.mismatch_max, span)
 
+    def ages_from(self, sequence: int, arrived: Ints) -> tuple[Floats, Floats]:
+        """Sum and largest of the ages of a sequence whose frames arrive later than they show.
+
+        Args:
+            sequence: its place.
+            arrived: when each of its frames did, int64 [T], ticks.
+
+        Returns:
+            As :attr:`age_sum` and :attr:`age_max`, float64 [M] each.
+        """
+        clock, outputs = self.clocks[sequence], self._outputs(sequence)
+        asked = clock.arrival(np.arange(self.lengths[sequence])) // clock.ticks_per_ns
+        since = (arrived // clock.ticks_per_ns)[self.frames[outputs]]
+        since[0] = asked[0]  # the initial box is there from the start
+        first, end = self.first[outputs].astype(np.int64), self.end[outputs].astype(np.int64)
+        ages = np.where(end > first, asked[np.maximum(end - 1, 0)] - since[:, None], 0)
+        per_ns = clock.ticks_per_ns / clock.frame_ticks
+        return (asked.sum() - since @ (end - first)) * per_ns, ages.max(axis=0) * per_ns
+
+    def _outputs(self, sequence: int) -> slice:
+        return slice(int(self.offsets[sequence]), int(self.offsets[sequence + 1]))
+
     @property
     def longest_stale(self) -> Floats:
         """Longest time that one output answered, nominal frame intervals, float64 [S, M].
@@ -209,7 +267,7 @@ class Pairing:
     @cached_property
     def is_even(self) -> bool:
         """Whether frames of all sequences arrive evenly."""
-        return all(clock.is_even for clock in set(self.clocks))
+        return self.steps is not None
 
     def _instants(self, sequence: int) -> Ints:
         """The ticks at which the frames of a sequence arrive, and its end, int64 [T + 1]."""
@@ -247,7 +305,7 @@ def pair(
     if not isinstance(schedules, Schedules):
         schedules = Schedules.of(schedules)
     clocks, lengths, offsets = schedules.clocks, schedules.lengths, schedules.offsets
-    if len({(clock.ticks_per_ns, clock.frame_ticks) for clock in set(clocks)}) != 1:
+    if len({(clock.ticks_per_ns, clock.frame_ticks) for clock in schedules.kinds}) != 1:
         raise LaeError("sequences of different frame rates cannot be paired together")
     at_once = not schedules.scores_latency[0]
     if (schedules.scores_latency == at_once).any():
@@ -259,7 +317,8 @@ def pair(
         raise LaeError(f"forecasting cannot cost {cost_ns} ns, less than nothing")
     cost = cost_ns * clocks[0].ticks_per_ns
     visible = schedules.visible
-    last_ready = int(visible[visible < NEVER].max()) + cost
+    seen = visible if schedules.whole is None else visible[visible < NEVER]
+    last_ready = int(seen.max()) + cost
     if last_ready > MAX_INT64:
         raise LaeError(f"forecasting cannot cost {cost_ns:g} ns: the clock ends before")
     largest = max(last_ready // interval, int(lengths.max())) * scale
@@ -270,39 +329,37 @@ def pair(
             "large for exact 64-bit arithmetic: use fewer digits"
         )
     frames = schedules.frames
-    overlaps = schedules.start[1:] < schedules.ready[:-1]
-    overlaps[offsets[1:-1] - 1] = False
-    if not at_once and schedules.whole is None and overlaps.any():
-        raise LaeError(
-            "calls overlap, as under the rule of VOT, which never scores latency: such a policy "
-            "says so by an attribute, scores_latency = False"
-        )
+    if not at_once and schedules.whole is None:
+        overlaps = schedules.start[1:] < schedules.ready[:-1]
+        overlaps[offsets[1:-1] - 1] = False
+        if overlaps.any():
+            raise LaeError(
+                "calls overlap, as under the rule of VOT, which never scores latency: such a "
+                "policy says so by an attribute, scores_latency = False"
+            )
     m = np.array(numerators, np.int64)
     steps: Ints | None = None
-    next_steps: Ints | None = None
-    if all(clock.is_even for clock in set(clocks)):
+    arrived: Frames | None = None
+    if all(clock.is_even for clock in schedules.kinds):
         if at_once:
             steps = frames * scale
         else:
             steps = _steps(visible + cost, interval, scale)
-            steps[visible == NEVER] = _NEVER
+            if len(seen) < len(visible):
+                steps[visible == NEVER] = _NEVER
         steps[offsets[:-1]] = -_NEVER
-        next_steps = np.append(steps[1:], _NEVER)
-        next_steps[offsets[1:] - 1] = _NEVER
-        first, end = _first_visible(steps, m, scale, offsets, lengths)
     else:
         permitted = [each * interval // scale for each in numerators]
         if last_ready + max(map(abs, permitted)) > MAX_INT64:
             raise LaeError("the permitted latencies are too large for exact 64-bit arithmetic")
         since = np.array(permitted, np.int64)
-        first = np.concatenate(
+        arrived = np.concatenate(
             [
-                _first_arrived(s, s.clock.arrival(s.frames) if at_once else seen + cost, since)
-                for s, seen in zip(schedules, np.split(visible, offsets[1:-1]))
+                _first_arrived(s, s.clock.arrival(s.frames) if at_once else its + cost, since)
+                for s, its in zip(schedules, np.split(visible, offsets[1:-1]))
             ]
         )
-        end = _ends(first, offsets, lengths)
-    return Pairing(lengths, offsets, frames, steps, next_steps, scale, m, first, end, clocks)
+    return Pairing(lengths, offsets, frames, steps, scale, m, clocks, arrived)
 
 
 def _first_arrived(schedule: Schedule, visible: Ints, permitted: Ints) -> Frames:

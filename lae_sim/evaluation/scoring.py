@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from lae_sim._arrays import Bools, Floats, Ints
+from lae_sim._arrays import Bools, Floats, Frames, Ints
 from lae_sim._compiled import compiled
 from lae_sim.evaluation.metrics import (
     CENTRE_THRESHOLDS,
@@ -24,10 +25,11 @@ from lae_sim.evaluation.metrics import (
     is_box,
     is_scored,
 )
-from lae_sim.evaluation.pairing import Histories, Pairs, ranges
+from lae_sim.evaluation.pairing import Histories, Pairing, Pairs, ranges
 from lae_sim.trace.recording import Recording
 
 _CHUNK = 1 << 14  # pairs at once: what is made of them stays in the cache
+_LAGS = 16  # frames from an output's to the one that it answers for, of which more is kept
 _SUMS = (*METRICS, "within50")
 _EXACT = 52  # bits of whole numbers that float64 holds, with one to spare
 
@@ -82,6 +84,77 @@ class Scorer:
             curves_at,
         )
 
+    def held(
+        self,
+        which: Ints,
+        pairing: Pairing,
+        table: Floats,
+        row: Ints,
+        own: Bools,
+        curves_at: int = 0,
+    ) -> Scored | None:
+        """Score the latest output's box as the answer to each query, in one kernel.
+
+        It is what :meth:`of` makes of the answers of :class:`.base.Hold`, bit for bit.
+
+        Args:
+            which: the recording of each sequence, by its place, int64 [S].
+            pairing: of the sequences.
+            table, row: boxes, float64 [N, 4], and the row of each output's, int64 [n].
+            own: whether a sequence's boxes are those of its recording, bool [S].
+            curves_at: index of a permitted latency.
+
+        Returns:
+            None where there are no kernels, or not for this.
+        """
+        replaces = self._convention.keeps_answer and not is_box(table).all()
+        if pairing.steps is None or replaces or not compiled():
+            return None
+        from lae_sim.evaluation.kernels import count_held
+
+        tally = self._tally(which, len(pairing.sigmas), curves_at)
+        repeats = len(which) > len(self._recordings)
+        steps, success, precision = tally.empty()
+        count_held(
+            self._bases[which],
+            self._truth,
+            pairing.lengths,
+            pairing.offsets,
+            pairing.frames,
+            pairing.steps,
+            pairing.scale,
+            pairing.sigmas,
+            np.ascontiguousarray(table),
+            row,
+            own & repeats,
+            self._found if repeats else np.empty((0, 0), np.int32),
+            *self._rule,
+            tally.curves_at,
+            steps,
+            success,
+            precision,
+            tally.failure,
+        )
+        tally.add_counted(steps, success, precision)
+        return self._shares(which, tally)
+
+    @cached_property
+    def _found(self) -> Frames:
+        """What pairs of near frames of a recording count, as kernels find out (``count_held``)."""
+        return np.zeros((len(self._truth[0]), _LAGS), np.int32)
+
+    @property
+    def _rule(self) -> tuple[int, bool, bool, bool, int]:
+        """The convention as kernels take it."""
+        convention = self._convention
+        return (
+            ("size", "positive", "finite").index(convention.valid),
+            convention.leaves_out,
+            convention.by_centre,
+            convention.first_frame_is_truth,
+            convention.thresholds - 1,
+        )
+
     def offline(self) -> Scored:
         """Score every frame's own box of each recording; NaN for those that lack some."""
         boxes = np.concatenate([recording.boxes for recording in self._recordings])
@@ -103,10 +176,18 @@ class Scorer:
         curves_at: int = 0,
     ) -> Scored:
         """Score answers, each part with the sequence of each pair, int64 [P]."""
-        tally = _Tally(self._lengths[which], count, curves_at, self._convention.thresholds)
+        tally = self._tally(which, count, curves_at)
         counted = self._by_kernel if compiled() else self._by_numpy
         for part in parts:
             counted(tally, self._bases[which], *_kept(*part, self._convention))
+        return self._shares(which, tally)
+
+    def _tally(self, which: Ints, count: int, curves_at: int) -> _Tally:
+        """Nothing counted yet, of some recordings."""
+        return _Tally(self._lengths[which], count, curves_at, self._convention.thresholds)
+
+    def _shares(self, which: Ints, tally: _Tally) -> Scored:
+        """What all pairs of some recordings come to."""
         tally.failure[~self._is_scored[which]] = -1
         thresholds = {"auc": self._convention.thresholds, "norm_auc": len(NORM_THRESHOLDS)}
         every = self._counted[which, None]
@@ -117,8 +198,8 @@ class Scorer:
             bests = ("auc", "within50", "norm_auc", "norm_auc")
             for metric, best in zip(METRICS, bests):
                 scores[metric] = np.where(sums[best] > 0, scores[metric], np.nan)
-            success[np.isnan(scores["auc"][:, curves_at])] = np.nan
-            precision[np.isnan(scores["dp20"][:, curves_at])] = np.nan
+            success[np.isnan(scores["auc"][:, tally.curves_at])] = np.nan
+            precision[np.isnan(scores["dp20"][:, tally.curves_at])] = np.nan
         return Scored(scores, tally.failure, success, precision)
 
     def _by_numpy(
@@ -141,7 +222,6 @@ class Scorer:
         """Count pairs one after another; equal bit for bit."""
         from lae_sim.evaluation.kernels import count_pairs
 
-        convention = self._convention
         steps, success, precision = tally.empty()
         count_pairs(
             bases,
@@ -151,11 +231,7 @@ class Scorer:
             paired.sigma_from,
             paired.sigma_to,
             np.ascontiguousarray(boxes),
-            ("size", "positive", "finite").index(convention.valid),
-            convention.leaves_out,
-            convention.by_centre,
-            convention.first_frame_is_truth,
-            convention.thresholds - 1,
+            *self._rule,
             tally.curves_at,
             steps,
             success,

@@ -1,5 +1,6 @@
 from .film import Scene, draw_frame, film_strip
 from .lines import draw_curves
+from .pipeline import waterfall_figure
 from .replay import (
     fidelity_figure,
     success_and_precision,
@@ -18,4 +19,5 @@ __all__ = [
     "success_and_precision",
     "sweep_figure",
     "timeline_figure",
+    "waterfall_figure",
 ]

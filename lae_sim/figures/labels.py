@@ -1,6 +1,9 @@
-"""What figures and tables call metrics and settings."""
+"""What figures and tables call metrics and settings, and say of pipelines."""
 
 from __future__ import annotations
+
+from operator import itemgetter
+from typing import Any
 
 METRIC_LABELS = {
     "auc": "AUC",
@@ -19,3 +22,13 @@ METRIC_LABELS = {
 def setting_label(latency: str, scale: float) -> str:
     """A latency and its scale, such as ``"recorded x 2"``."""
     return latency if scale == 1 else f"{latency} x {scale:g}"
+
+
+def bottleneck_text(pipeline: dict[str, Any]) -> str:
+    """The first stage of a pipeline that is too slow, in a sentence; or that none is."""
+    if pipeline["bottleneck"] is not None:
+        return str(pipeline["bottleneck"]["text"])
+    loads = [(each["load"], each["stage"]) for each in pipeline["stages"]]
+    loads += [(each["load"], each["resource"]) for each in pipeline["resources"]]
+    load, busiest = max(loads, key=itemgetter(0))
+    return f"every stage keeps up; {busiest}, the busiest, with {load:.0%} of what it can do"

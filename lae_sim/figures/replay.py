@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from lae_sim._arrays import Floats
 from lae_sim.comparison.fidelity import FidelityRow
+from lae_sim.engine.scheduler import Schedule
 from lae_sim.evaluation.evaluate import Evaluation
 from lae_sim.evaluation.pairing import Pairing, pair
 from lae_sim.evaluation.totals import CurveTotals
@@ -41,6 +42,8 @@ from lae_sim.replay.run import Run
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from lae_sim.engine.stages import PipelineSchedule
 
 
 Report = dict[str, Any]
@@ -242,12 +245,15 @@ def timeline_for_paper(run: Run, sigma: Fraction = Fraction(0)) -> ColumnFigure:
     few = frames[min(4, len(frames) - 1)] - first
     shown = range(first, min(first + min(max(few, 8), 16), schedule.length))
     draw = partial(_draw_timeline, run=run, sigma=sigma, shown=shown, size=6)
-    name = run.recording.name
+    rows = len(getattr(schedule, "stages", " "))  # of a pipeline; else there is one, the tracker's
+    name, works = run.recording.name, "the tracker at work on them"
+    if schedule.visible is not None:
+        works = "the stages at work (hollow: a frame is held up; crosses: frames are dropped)"
     return ColumnFigure(
         f"timeline-{name}",
-        f"{name}: frames as they arrive (hollow: skipped), the tracker at work on them, and the "
-        "frame whose output answers the query for each",
-        partial(column_figure, draw, 1.5),
+        f"{name}: frames as they arrive (hollow: skipped), {works}, and the frame whose output "
+        "answers the query for each",
+        partial(column_figure, draw, 1.2 + 0.3 * rows),
     )
 
 
@@ -264,28 +270,89 @@ def _draw_timeline(
     clock = schedule.clock
     frame_ms = clock.milliseconds(1)
     processed = set(schedule.frames.tolist())
+    left = clock.arrival_ms(shown.start) - frame_ms / 2
+    right = clock.arrival_ms(shown.stop) + frame_ms / 2
+    if schedule.visible is not None:  # only those of pipelines are later than they are ready
+        rows = _draw_stages(axes, cast("PipelineSchedule", schedule), left, right, size)
+    else:
+        rows = ["tracker busy"]
+        _draw_calls(axes, schedule, shown, left, right, size)
+    top = len(rows) + 1
     for frame in shown:
         taken = frame in processed
         colour = BLUE if taken else VERMILION
         arrival_ms = clock.arrival_ms(frame)
-        axes.plot(arrival_ms, 2, "o", color=colour, fillstyle="full" if taken else "none")
-        axes.annotate(str(frame), (arrival_ms, 2.18), ha="center", fontsize=size)
+        axes.plot(arrival_ms, top, "o", color=colour, fillstyle="full" if taken else "none")
+        axes.annotate(str(frame), (arrival_ms, top + 0.18), ha="center", fontsize=size)
+    known = pairing or pair([schedule], [sigma])
+    _draw_queries(axes, run, sigma, known, shown, size)
+    names = ["query and source", *rows, "world frame\n(hollow: skipped)"]
+    axes.set_yticks(range(len(names)), names)
+    axes.set(ylim=(-0.6, top + 0.5), xlabel="time (ms)")
+    axes.set_xlim(left, right)
+
+
+def _draw_calls(
+    axes: Axes, schedule: Schedule, shown: range, left: float, right: float, size: float
+) -> None:
+    """What the tracker works on."""
+    clock = schedule.clock
     ticks_per_ms = clock.ticks_per_ns * 1e6
-    left = clock.arrival_ms(shown.start) - frame_ms / 2
-    right = clock.arrival_ms(shown.stop) + frame_ms / 2
     for frame, start, ready in zip(schedule.frames, schedule.start, schedule.ready):
         if ready >= clock.arrival(shown.start) and frame < shown.stop:
             begin, length = start / ticks_per_ms, (ready - start) / ticks_per_ms
             axes.barh(1, length, left=begin, height=0.42, color=BLUE, edgecolor="white")
             middle = (max(begin, left) + min(begin + length, right)) / 2
             axes.text(middle, 1, str(frame), ha="center", va="center", color="w", fontsize=size + 1)
-    known = pairing or pair([schedule], [sigma])
-    _draw_queries(axes, run, sigma, known, shown, size)
-    axes.set_yticks(
-        [2, 1, 0], ["world frame\n(hollow: skipped)", "tracker busy", "query and source"]
-    )
-    axes.set(ylim=(-0.6, 2.5), xlabel="time (ms)")
-    axes.set_xlim(left, right)
+
+
+def _draw_stages(
+    axes: Axes, schedule: PipelineSchedule, left: float, right: float, size: float
+) -> list[str]:
+    """What each stage works on (hollow: waits with it), and what it drops; names of its rows."""
+    from lae_sim.engine.stages import Drop  # with SimPy, which few replays need
+    from lae_sim.evaluation.pipeline import shared_out
+
+    ticks_per_ms = schedule.clock.ticks_per_ns * 1e6
+    end = schedule.clock.end(schedule.length)
+    pipeline = schedule.pipeline
+    stages = [stage for stage in pipeline.stages if stage.name != pipeline.output][::-1]
+    stages.insert(0, pipeline.way[-1])  # the lowest row, which answers the queries below it
+    for row, stage in enumerate(stages, 1):
+        log, height = schedule.stages[stage.name], 0.62 / stage.workers
+        held = np.where(log.left >= 0, log.left, np.where(log.gone >= 0, log.gone, 2 * end))
+        spans = [
+            (int(log.taken[frame]), int(held[frame]), frame)
+            for frame in np.flatnonzero(log.taken >= 0).tolist()
+        ]
+        for worker, frame in shared_out(spans):
+            instants = [getattr(log, what)[frame] for what in ("taken", "started", "finished")]
+            taken, started, finished = (tick / ticks_per_ms for tick in instants)
+            until = held[frame] / ticks_per_ms
+            if until < left or taken > right:
+                continue
+            place = row + 0.31 - height * (worker + 0.5)
+            if started < 0:
+                started = finished = until
+            for begin, stop, colour in (
+                (taken, started, "white"),
+                (started, finished, BLUE),
+                (finished, until, "white"),
+            ):
+                if stop > begin:
+                    axes.barh(
+                        place, stop - begin, left=begin, height=0.9 * height,
+                        color=colour, edgecolor=BLUE, linewidth=0.7,
+                    )  # fmt: skip
+            if (width := min(finished, right) - max(started, left)) > 0.02 * (right - left):
+                middle = max(started, left) + width / 2
+                axes.text(
+                    middle, place, str(frame), ha="center", va="center", color="w", fontsize=size
+                )
+        lost = log.gone[log.dropped == Drop.FULL] / ticks_per_ms
+        lost = lost[(lost >= left) & (lost <= right)]
+        axes.plot(lost, np.full(len(lost), row + 0.4), "x", color=VERMILION, markersize=4)
+    return [stage.name for stage in stages]
 
 
 def _draw_queries(
@@ -294,7 +361,8 @@ def _draw_queries(
     """A mark for each query, joined to the moment when the output that answers it was ready."""
     schedule = run.schedule
     clock = schedule.clock
-    spans = zip(schedule.frames, schedule.ready, pairing.first[:, 0], pairing.end[:, 0])
+    seen = schedule.ready if schedule.visible is None else schedule.visible
+    spans = zip(schedule.frames, seen, pairing.first[:, 0], pairing.end[:, 0])
     for source, ready, begin, stop in spans:
         for frame in range(max(begin, shown.start), min(stop, shown.stop)):
             query = clock.arrival_ms(frame, sigma)

@@ -114,6 +114,51 @@ def parse_pipeline(document: Mapping[str, Any], name: str = "pipeline") -> Pipel
     return pipeline
 
 
+def pipeline_document(pipeline: Pipeline) -> dict[str, Any]:
+    """A pipeline as plain values, which :func:`parse_pipeline` makes the same pipeline of.
+
+    Raises:
+        LaeError: if a time is a function, which has no name; it says where.
+    """
+    camera = _values(pipeline.camera)
+    if not isinstance(camera["drops"], str):
+        camera["drops"] = list(camera["drops"])
+    if camera["jitter"] is None:
+        del camera["jitter"]
+    return {
+        "name": pipeline.name,
+        "tracker": pipeline.tracker,
+        "camera": {key: _plain("camera", key, value) for key, value in camera.items()},
+        "resources": dict(pipeline.resources),
+        "stages": [_plain_stage(stage) for stage in pipeline.stages],
+    }
+
+
+def _plain_stage(stage: Stage) -> dict[str, Any]:
+    values = {**_values(stage), "queue": "unbounded" if stage.queue is None else stage.queue}
+    where = f"stage {stage.name!r}"
+    return {key: _plain(where, key, value) for key, value in values.items() if value is not None}
+
+
+def _values(record: Camera | Stage) -> dict[str, Any]:
+    return {each.name: getattr(record, each.name) for each in fields(record)}
+
+
+def _plain(where: str, key: str, value: Any) -> Any:
+    if isinstance(value, Plugin):
+        return value.label
+    if callable(value):
+        raise LaeError(f"{where}: {key}: a function: name it, as 'package.module:object'")
+    return value
+
+
+def times_named(pipeline: Pipeline) -> list[str]:
+    """The names of all times in a pipeline."""
+    times = [pipeline.camera.jitter, *(stage.time for stage in pipeline.stages)]
+    named = [time.label if isinstance(time, Plugin) else time for time in times]
+    return [time for time in named if isinstance(time, str)]
+
+
 def _checked(what: str, document: Any, kind: type) -> Mapping[str, Any]:
     """A table whose keys are those of a record.
 

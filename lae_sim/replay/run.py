@@ -11,7 +11,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from lae_sim._arrays import Floats, Ints
+from lae_sim._arrays import Bools, Floats, Ints
 from lae_sim.boxes import PARTED_IOU, iou
 from lae_sim.engine.arrivals import same_arrivals, with_arrivals
 from lae_sim.engine.clock import Clock
@@ -138,19 +138,23 @@ class RunBatch:
     Attributes:
         recordings: of each run.
         schedules: of the runs, with n processed frames.
-        boxes: see :class:`Run`, float64 [n, 4].
+        table: boxes, those that the runs have and perhaps others, float64 [N, 4].
+        row: the row of each processed frame's box in it, int64 [n].
         departures, disagreement: see :class:`Run`, int64 [R] and float64 [R].
         modelled: see :class:`Run`.
         repetition: of each, int64 [R]; 0 where times are not drawn again and again.
+        own: whether a run's boxes are known to be those of its recording, bool [R].
     """
 
     recordings: tuple[Recording, ...]
     schedules: Schedules
-    boxes: Floats
+    table: Floats
+    row: Ints
     departures: Ints
     disagreement: Floats
     modelled: tuple[Outcomes | None, ...]
     repetition: Ints
+    own: Bools
 
     def __len__(self) -> int:
         """Number of runs R."""
@@ -161,7 +165,7 @@ class RunBatch:
         return Run(
             self.recordings[r],
             self.schedules[r],
-            self.boxes[self.schedules.offsets[r] : self.schedules.offsets[r + 1]],
+            self.table.take(self.row[slice(*self.schedules.offsets[r : r + 2])], axis=0),
             int(self.departures[r]),
             float(self.disagreement[r]),
             self.modelled[r],
@@ -177,11 +181,32 @@ class RunBatch:
         return RunBatch(
             self.recordings[some],
             self.schedules.part(begin, end),
-            self.boxes[offsets[begin] : offsets[end]],
+            self.table,
+            self.row[offsets[begin] : offsets[end]],
             self.departures[some],
             self.disagreement[some],
             self.modelled[some],
             self.repetition[some],
+            self.own[some],
+        )
+
+    def answering(self, which: Ints, boxes: Sequence[Floats]) -> RunBatch:
+        """Some of them, perhaps one several times, with other boxes than theirs.
+
+        Args:
+            which: places of runs, int64 [R].
+            boxes: of each the boxes, float64 [n, 4].
+        """
+        return RunBatch(
+            tuple(self.recordings[r] for r in which.tolist()),
+            Schedules.of([self.schedules[r] for r in which.tolist()]),
+            table := np.concatenate(boxes),
+            np.arange(len(table)),
+            self.departures[which],
+            self.disagreement[which],
+            (None,) * len(which),
+            self.repetition[which],
+            np.zeros(len(which), np.bool_),
         )
 
     @classmethod
@@ -190,11 +215,13 @@ class RunBatch:
         return cls(
             tuple(run.recording for run in runs),
             Schedules.of([run.schedule for run in runs]),
-            np.concatenate([run.boxes for run in runs]),
+            boxes := np.concatenate([run.boxes for run in runs]),
+            np.arange(len(boxes)),
             np.array([run.departures for run in runs], np.int64),
             np.array([run.disagreement for run in runs]),
             tuple(run.modelled for run in runs),
             np.zeros(len(runs), np.int64),
+            np.zeros(len(runs), np.bool_),
         )
 
     @classmethod
@@ -202,15 +229,26 @@ class RunBatch:
         """Several batches as one."""
         if len(parts) == 1:
             return parts[0]
+        tables, which = distinct(part.table for part in parts)
+        sizes = [len(table) for table in tables]
+        begins = (np.cumsum(sizes) - sizes)[which].tolist()
         return cls(
             tuple(chain.from_iterable(part.recordings for part in parts)),
             Schedules.joined([part.schedules for part in parts]),
-            np.concatenate([part.boxes for part in parts]),
+            np.concatenate(tables) if len(tables) > 1 else tables[0],
+            np.concatenate([part.row + begin for part, begin in zip(parts, begins)]),
             np.concatenate([part.departures for part in parts]),
             np.concatenate([part.disagreement for part in parts]),
             tuple(chain.from_iterable(part.modelled for part in parts)),
             np.concatenate([part.repetition for part in parts]),
+            np.concatenate([part.own for part in parts]),
         )
+
+    @cached_property
+    def boxes(self) -> Floats:
+        """The box of each processed frame, float64 [n, 4]."""
+        boxes: Floats = self.table.take(self.row, axis=0)
+        return boxes
 
     @cached_property
     def distinct(self) -> tuple[list[Recording], Ints]:
@@ -220,13 +258,11 @@ class RunBatch:
 
 def distinct(items: Iterable[Item]) -> tuple[list[Item], Ints]:
     """Objects, each once, in the order of their first places, and where each stands, int64 [n]."""
-    found: dict[int, Item] = {}
-    places: dict[int, int] = {}
-    which = []
-    for item in items:
-        found[id(item)] = item
-        which.append(places.setdefault(id(item), len(places)))
-    return list(found.values()), np.array(which, np.int64)
+    items = list(items)
+    names = list(map(id, items))
+    found = dict(zip(names, items))
+    places = dict(zip(found, range(len(found))))
+    return list(found.values()), np.fromiter(map(places.__getitem__, names), np.int64, len(items))
 
 
 @runtime_checkable
@@ -377,9 +413,9 @@ def _run(jobs: Sequence[_Job], schedules: Schedules, repetition: Ints) -> RunBat
     lengths = np.array([len(each.recording) for each in tables], np.int64)
     row: Ints = np.repeat((np.cumsum(lengths) - lengths)[which], np.diff(schedules.offsets))
     row += schedules.frames
-    boxes = np.concatenate([each.recording.boxes for each in tables]).take(row, axis=0)
-    absent = np.isnan(boxes[:, 0])
-    if absent.any():
+    table = np.concatenate([each.recording.boxes for each in tables])
+    absent = np.isnan(table[:, 0])
+    if absent.any() and (absent := absent.take(row)).any():
         r = int(np.searchsorted(ends, absent.argmax(), "right"))
         _boxes(used[r].recording, schedules.frames[of_run[r]])
     departs = np.concatenate([each.before for each in tables]).take(row)
@@ -391,18 +427,21 @@ def _run(jobs: Sequence[_Job], schedules: Schedules, repetition: Ints) -> RunBat
     for r, job in enumerate(jobs):
         if not job.passes and job.search is None:
             continue
-        own = used[r], schedules.frames[of_run[r]], boxes[of_run[r]], int(departures[r])
+        boxes = table.take(row[of_run[r]], axis=0)
+        own = used[r], schedules.frames[of_run[r]], boxes, int(departures[r])
         if job.passes:
             disagreement[r] = job.disagreement(*own)
         modelled[r] = job.modelled(*own)
     return RunBatch(
         tuple(job.recording for job in jobs),
         schedules,
-        boxes,
+        table,
+        row,
         departures,
         disagreement,
         tuple(modelled),
         repetition,
+        np.array([each is job.own for each, job in zip(used, jobs)]),
     )
 
 

@@ -30,7 +30,7 @@ from lae_sim.study.cells import replayed
 from lae_sim.study.records import SummaryRow
 from lae_sim.study.summary import Scores, ranked
 from lae_sim.study.view import View, run_of
-from lae_sim.trace.file import held, read_trace
+from lae_sim.trace.file import read_held
 
 if TYPE_CHECKING:
     from lae_sim.datasets.frames import ImageSequence
@@ -272,7 +272,7 @@ def close_ups(
         said[0] += "; of the recorded boxes"
     try:
         with explained("failed"):
-            trace = held(read_trace(setting.trace.path, tuple(chosen)))
+            trace = read_held(setting.trace.path, tuple(chosen))
             runs = {run.recording.name: run for run in reversed([*replayed(setting, trace)])}
             costs = {cell.forecaster: cell.cost_ns for cell in view.results.plan.cells}
             sigma = setting.world.sigmas[0]

@@ -18,7 +18,7 @@ from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import Observer, ScoredRun
 from lae_sim.evaluation.events import event_log
 from lae_sim.files import NAME_MAX, file_names, staged_folder, written_whole
-from lae_sim.trace.columns import from_numpy
+from lae_sim.trace.columns import from_numpy, from_texts
 from lae_sim.trace.recording import BATCH_ROWS
 
 
@@ -49,10 +49,10 @@ def outputs_file(path: str, asked: Sequence[tuple[str, Fraction]]) -> Iterator[O
                 answers = scored.answers[forecaster, sigma]
                 length = len(answers.boxes)
                 write(
-                    _repeated(scored.run.recording.name, length),
+                    from_texts([scored.run.recording.name], length),
                     from_numpy(np.arange(length, dtype=np.int32)),
                     from_numpy(np.full(length, float(sigma))),
-                    _repeated(forecaster, length),
+                    from_texts([forecaster], length),
                     from_numpy(answers.source_frame.astype(np.int32)),
                     *(from_numpy(answers.boxes[:, i]) for i in range(4)),
                 )
@@ -82,7 +82,7 @@ def schedule_file(path: str, clock: Clock) -> Iterator[Observer]:
         def observer(scored: ScoredRun) -> None:
             schedule = scored.run.schedule
             write(
-                _repeated(scored.run.recording.name, len(schedule.frames)),
+                from_texts([scored.run.recording.name], len(schedule.frames)),
                 from_numpy(schedule.frames.astype(np.int32)),
                 from_numpy(schedule.start),
                 from_numpy(schedule.ready),
@@ -193,12 +193,6 @@ def _parquet(path: str, schema: Any) -> Iterator[Callable[..., None]]:
 
         yield write
         flush()
-
-
-def _repeated(text: str, length: int) -> Any:
-    import pyarrow as pa
-
-    return pa.repeat(pa.scalar(text, pa.string()), length)
 
 
 def sigma_text(sigma: Fraction) -> str:

@@ -7,13 +7,14 @@ full. ``contents.json`` says what each file shows.
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import islice, product
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,7 @@ from lae_sim.report.table import (
     write_csv,
     write_parquet,
 )
+from lae_sim.trace.columns import from_values
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from lae_sim.figures.column import DrawnFigure
 
 CONTENTS = "contents.json"
+_ROWS, _CHUNKS = 1 << 10, 64  # of records: rows at once, and how many times these a row group is
 FIGURES, TABLES = "figures", "tables"
 _OURS = re.compile(rf"({FIGURES}|{TABLES})/[\w-][\w.-]*\.(pdf|svg|tex|csv|parquet)")
 
@@ -60,19 +63,32 @@ class PaperTable:
 
 
 @dataclass(frozen=True)
+class Records:
+    """Rows that are made as they are written, since all at once they may be large.
+
+    Attributes:
+        names: of the columns.
+        rows: makes all rows anew: plain values by name; what is unknown is None, NaN or not there.
+    """
+
+    names: Sequence[str]
+    rows: Callable[[], Iterable[Mapping[str, Any]]]
+
+
+@dataclass(frozen=True)
 class Paper:
     """What is written for a paper.
 
     Attributes:
         figures: figures; of an iterator, drawn when they are asked for.
         tables: tables in all forms.
-        frames: tables by name that are CSV and Parquet alone.
+        frames: tables by name that are CSV and Parquet alone; what may be long as records.
         documents: JSON objects by the name of their file.
     """
 
     figures: Iterable[DrawnFigure] = ()
     tables: Sequence[PaperTable] = ()
-    frames: Mapping[str, DataFrame] = field(default_factory=dict)
+    frames: Mapping[str, DataFrame | Records] = field(default_factory=dict)
     documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
@@ -204,16 +220,80 @@ def write_table(table: PaperTable, folder: Path) -> list[Path]:
     return paths
 
 
-def write_frame(frame: DataFrame, stem: Path) -> list[Path]:
-    """Write a table of pandas as CSV and as Parquet, each file whole; their paths.
+def write_frame(frame: DataFrame | Records, stem: Path) -> list[Path]:
+    """Write a table as CSV and as Parquet, each file whole; their paths.
 
     Raises:
         LaeError: if a file cannot be written.
     """
     paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("csv", "parquet")]
-    for path in paths:
-        write_frame_file(frame, path)
+    if isinstance(frame, Records):
+        _write_records(frame, *paths)
+    else:
+        for path in paths:
+            write_frame_file(frame, path)
     return paths
+
+
+def _write_records(records: Records, csv_path: Path, parquet_path: Path) -> None:
+    """Write rows as they come, with the types that pandas would give their columns."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    schema = pa.schema(_kinds(records))
+    texts = [field.name for field in schema if field.type == pa.string()]
+    floats = [field.name for field in schema if field.type == pa.float64()]
+    with (
+        written_whole(csv_path) as csv_temporary,
+        open(csv_temporary, "w", newline="", encoding="utf-8") as csv_file,
+        written_whole(parquet_path) as temporary,
+        open(temporary, "wb") as sink,  # whose name need not be UTF-8
+        pq.ParquetWriter(sink, schema) as writer,
+    ):
+        lines = csv.writer(csv_file, lineterminator="\n")
+        lines.writerow(records.names)
+        rows = iter(records.rows())
+        waiting: list[Any] = []
+        while some := [dict(row) for row in islice(rows, _ROWS)]:
+            for row in some:
+                row |= {name: None if _is_unknown(row.get(name)) else float(row[name])
+                        for name in floats}  # fmt: skip
+                quoted = row | {name: csv_cell(row.get(name)) for name in texts}
+                lines.writerow([quoted.get(name) for name in records.names])
+            columns = [[row.get(name) for row in some] for name in records.names]
+            arrays = [*map(from_values, columns, schema.types)]
+            waiting.append(pa.Table.from_arrays(arrays, schema=schema))
+            if len(waiting) == _CHUNKS:
+                writer.write_table(pa.concat_tables(waiting))
+                waiting.clear()
+        if waiting:
+            writer.write_table(pa.concat_tables(waiting))
+
+
+def _kinds(records: Records) -> Iterator[tuple[str, Any]]:
+    """The columns' types: of whole numbers float64 if some are unknown, as pandas has it."""
+    import pyarrow as pa
+
+    found: dict[str, set[type]] = {name: set() for name in records.names}
+    partly = set()
+    for row in records.rows():
+        for name, kinds in found.items():
+            value = row.get(name)
+            if value is not None:
+                kinds.add(type(value))
+            if _is_unknown(value):
+                partly.add(name)
+    for name, kinds in found.items():
+        if str in kinds:
+            yield name, pa.string()
+        elif kinds <= {bool}:
+            yield name, pa.bool_() if kinds else pa.null()
+        else:
+            yield name, pa.float64() if float in kinds or name in partly else pa.int64()
+
+
+def _is_unknown(value: Any) -> bool:
+    return value is None or value != value
 
 
 def write_frame_file(frame: DataFrame, path: Path) -> None:

@@ -21,6 +21,7 @@ from lae_sim.evaluation.evaluate import Curves, Evaluation
 from lae_sim.evaluation.metrics import METRICS
 from lae_sim.evaluation.modelled import MODELLED
 from lae_sim.evaluation.totals import RECOVERED, ModelledTotals, ScoreTotals, Totals, recovered
+from lae_sim.figures.labels import bottleneck_text
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.report.paper import PaperTable, TrackerScores, in_two_forms, with_and_without
 from lae_sim.report.table import (
@@ -434,6 +435,7 @@ def pipeline_text(report: Report, width: int | None = None) -> str:
         f"delivery on, and {_MS(result['capture_age_ms'])} from its capture on"
     )
     lines[-1:] = [fill(lines[-1], 100, break_on_hyphens=False)]
+    lines.append(fill(bottleneck_text(pipeline), 100, break_on_hyphens=False))
     return "\n".join(lines)
 
 

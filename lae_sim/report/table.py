@@ -18,6 +18,7 @@ from typing import Any
 
 from lae_sim.errors import visible
 from lae_sim.files import csv_cell
+from lae_sim.trace.columns import from_values
 
 Interval = tuple[float, float]
 
@@ -383,10 +384,14 @@ def write_parquet(table: Table, path: Path) -> None:
 
     arrays = {}
     for name, values in columns_of(table):
-        if any(isinstance(value, str) for value in values):
-            values = [None if value is None else visible(value) for value in values]
-        elif any(isinstance(value, float) for value in values):
-            values = [None if value is None else float(value) for value in values]
-        arrays[visible(name)] = pa.array(values)
+        known = [value for value in values if value is not None]
+        kind = pa.int64() if known else pa.null()
+        if any(isinstance(value, str) for value in known):
+            kind, values = pa.string(), [value and visible(value) for value in values]
+        elif any(isinstance(value, float) for value in known):
+            kind = pa.float64()
+        elif any(isinstance(value, bool) for value in known):
+            kind = pa.bool_()
+        arrays[visible(name)] = from_values(values, kind)  # pa.array would import pandas
     with pa.OSFile(os.fsencode(path), "wb") as sink:
         pq.write_table(pa.table(arrays), sink)

@@ -2,11 +2,13 @@
 
 Each sequence is a process of the trace, on its own clock: all begin at 0, so that instants are
 those of the event log. Its threads are the camera, the tracker, the forecasters and the queries.
-All events are slices, which show their names: a frame lasts until the next one arrives, an answer
-until the next query, a forecaster's state until its next update. Instants in microseconds are
-rounded down to whole nanoseconds; the exact ticks are among each slice's arguments. With a negative
-sigma all instants, not the ticks, are later by the least whole number of frames that puts the first
-query at 0 or after: Perfetto drops what comes before.
+These events are slices, which show their names: a frame lasts until the next one arrives, an answer
+until the next query, a forecaster's state until its next update. A pipeline has a thread for each
+worker of a stage and each place at a resource, counters of the frames that wait, and instants at
+which frames are delivered and dropped. Instants in microseconds are rounded down to whole
+nanoseconds; the exact ticks are among each slice's arguments. With a negative sigma all instants,
+not the ticks, are later by the least whole number of frames that puts the first query at 0 or
+after: Perfetto drops what comes before.
 
 Source: "Trace Event Format" (Google, 2016); https://ui.perfetto.dev opens the files.
 """
@@ -14,14 +16,17 @@ Source: "Trace Event Format" (Google, 2016); https://ui.perfetto.dev opens the f
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from fractions import Fraction
 from itertools import count, islice
-from math import ceil
+from math import ceil, inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from lae_sim.engine.scheduler import Schedule
 from lae_sim.errors import LaeError
 from lae_sim.evaluation.evaluate import Observer, ScoredRun
 from lae_sim.evaluation.pairing import Pairing, pair
@@ -31,6 +36,8 @@ from lae_sim.report.export import sigma_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from lae_sim.engine.stages import StageLog
 
 TraceEvent = dict[str, Any]
 """One object of the Trace Event Format."""
@@ -94,6 +101,130 @@ def _events_file(path: str, sigma: Fraction, costs: Mapping[str, int]) -> Iterat
         file.write("\n]}\n")
 
 
+class _Process:
+    """Makes the events of one process of the trace."""
+
+    def __init__(self, number: int, ticks_per_ns: int, early: int) -> None:
+        self._number, self._ticks_per_ns, self._early = number, ticks_per_ns, early
+        # a thread of its process's number would be its main thread, which Perfetto shows first
+        self._tracks = count(1000 * number)
+
+    def track(self) -> int:
+        """The number of a new thread."""
+        return next(self._tracks)
+
+    def thread(self, track: int, name: str) -> Iterator[TraceEvent]:
+        """The name and the place of a thread."""
+        return self.named("thread", track, name)
+
+    def named(self, kind: str, number: int, name: str) -> Iterator[TraceEvent]:
+        """The name and the place of a thread or of the process."""
+        place = {"ph": "M", "pid": self._number, "tid": number}
+        yield {**place, "name": f"{kind}_name", "args": {"name": name}}
+        yield {**place, "name": f"{kind}_sort_index", "args": {"sort_index": number}}
+
+    def mark(self, phase: str, track: int, tick: int, **more: Any) -> TraceEvent:
+        """An event of one instant."""
+        ts = self._ns(tick) / 1000
+        return {"ph": phase, "pid": self._number, "tid": track, "ts": ts, **more}
+
+    def span(self, track: int, name: str, start: int, end: int, **details: Any) -> TraceEvent:
+        """A slice."""
+        length_ns = self._ns(end) - self._ns(start)
+        return self.mark("X", track, start, dur=length_ns / 1000, name=name, args=details)
+
+    def _ns(self, tick: int) -> int:
+        return (tick + self._early) // self._ticks_per_ns
+
+
+def _call(frame: int, begin: int, end: int) -> dict[str, int]:
+    """What is said of the work on a frame."""
+    return {"frame": frame, "start_ticks": begin, "ready_ticks": end}
+
+
+def _pipeline_events(
+    events: _Process, schedule: Schedule
+) -> Generator[TraceEvent, None, dict[int, int]]:
+    """The threads of a pipeline's stages and resources; the thread of each of the tracker's calls.
+
+    Workers of a stage are alike: a frame goes to the first that is free.
+    """
+    from lae_sim.engine.stages import Drop, PipelineSchedule  # with SimPy, which few replays need
+    from lae_sim.evaluation.pipeline import WHY, shared_out
+
+    assert isinstance(schedule, PipelineSchedule)
+    pipeline, end = schedule.pipeline, schedule.clock.end(schedule.length)
+    track = events.track()
+    yield from events.thread(track, "delivery")
+    for frame, tick in enumerate(schedule.delivered.tolist()):
+        lost = tick < 0
+        tick = schedule.clock.arrival(frame) if lost else tick
+        name = f"lost {frame}" if lost else f"delivered {frame}"
+        yield events.mark("i", track, tick, s="t", name=name, args={"frame": frame, "tick": tick})
+    calls: dict[int, int] = {}
+    holding: dict[str, list[tuple[int, int, str, int]]] = {name: [] for name in pipeline.resources}
+    for stage in pipeline.stages:
+        log = schedule.stages[stage.name]
+        columns = (log.arrived, log.taken, log.started, log.finished, log.left, log.gone)
+        rows = [(frame, *row) for frame, row in enumerate(zip(*(c.tolist() for c in columns)))]
+        held = [(row[2], _free_again(row), row) for row in rows if row[2] >= 0]
+        tracks = [events.track() for _ in range(stage.workers)]
+        for number, track in enumerate(tracks, 1):
+            yield from events.thread(track, _numbered(stage.name, number, len(tracks)))
+        for worker, (frame, _, taken, started, finished, left, gone) in shared_out(held):
+            track, until = tracks[worker], started if started >= 0 else gone
+            if until > taken:
+                yield events.span(track, f"{frame} waits for {stage.resource}", taken, until)
+            if started >= 0:
+                details = _call(frame, started, finished)
+                yield events.span(track, f"frame {frame}", started, finished, **details)
+                if left < 0:  # it was still when all was over
+                    left = max(finished, end)
+                if left > finished:
+                    yield events.span(track, f"{frame} is blocked", finished, left)
+                if stage.resource is not None:
+                    holding[stage.resource].append((started, finished, stage.name, frame))
+                if stage.name == pipeline.tracker:
+                    calls[frame] = track
+        if dropped := [frame for frame, why in enumerate(log.dropped.tolist()) if why]:
+            track = events.track()
+            yield from events.thread(track, f"{stage.name}: dropped")
+            for frame in dropped:
+                why, tick = WHY[Drop(log.dropped[frame])], int(log.gone[frame])
+                details = {"frame": frame, "tick": tick}
+                yield events.mark("i", track, tick, s="t", name=f"{frame}: {why}", args=details)
+        yield from _queue_events(events, f"{stage.name}: queue", log)
+    for name, uses in holding.items():
+        tracks = [events.track() for _ in range(pipeline.resources[name])]
+        for number, track in enumerate(tracks, 1):
+            yield from events.thread(track, _numbered(name, number, len(tracks)))
+        for place, (begin, end, user, frame) in shared_out([(u[0], u[1], u) for u in uses]):
+            yield events.span(
+                tracks[place], f"{user} {frame}", begin, end, **_call(frame, begin, end)
+            )
+    return calls
+
+
+def _free_again(row: tuple[int, ...]) -> float:
+    """When the worker that took a frame is free for the next one."""
+    *_, left, gone = row
+    return left if left >= 0 else gone if gone >= 0 else inf
+
+
+def _queue_events(events: _Process, name: str, log: StageLog) -> Iterator[TraceEvent]:
+    """How many frames wait, whenever that changes."""
+    waited = (log.arrived >= 0) & ((log.taken >= 0) | (log.gone > log.arrived))
+    until = np.where(log.taken >= 0, log.taken, log.gone)[waited]
+    ticks, places = np.unique(np.concatenate([log.arrived[waited], until]), return_inverse=True)
+    change = np.repeat([1, -1], len(until))
+    for tick, length in zip(ticks.tolist(), np.bincount(places, change).cumsum().tolist()):
+        yield events.mark("C", 0, tick, name=name, args={"frames": int(length)})
+
+
+def _numbered(name: str, number: int, count: int) -> str:
+    return name if count == 1 else f"{name} {number}"
+
+
 def trace_events(
     run: Run,
     sigma: Fraction,
@@ -104,7 +235,7 @@ def trace_events(
     """The Trace Events of one sequence.
 
     Args:
-        run: the sequence, of which no two calls overlap.
+        run: the sequence; no two calls overlap, but those of a pipeline's tracker may.
         sigma: permitted latency of the queries, frames.
         costs: what an answer of each forecaster costs, ns. Forecasters whose answers cost the same
             share a track of queries.
@@ -115,33 +246,17 @@ def trace_events(
     schedule = run.schedule
     if pairings is None:
         pairings = {cost: pair([schedule], [sigma], cost) for cost in {0, *costs.values()}}
-    clock, ticks_per_ns = schedule.clock, schedule.clock.ticks_per_ns
+    clock = schedule.clock
     early = max(ceil(-sigma), 0) * clock.frame_ticks
-    # a thread of its process's number would be its main thread, which Perfetto shows first; flows
-    # are told apart over the whole file
-    tracks, flows = count(1000 * process), count(process << 32)
+    events, flows = _Process(process, clock.ticks_per_ns, early), count(process << 32)
+    span, mark, named = events.span, events.mark, events.thread
 
     def query(frame: int) -> int:
         return clock.query(frame, sigma)
 
-    def shown_ns(tick: int) -> int:
-        return (tick + early) // ticks_per_ns
-
-    def named(kind: str, number: int, name: str) -> Iterator[TraceEvent]:
-        place = {"ph": "M", "pid": process, "tid": number}
-        yield {**place, "name": f"{kind}_name", "args": {"name": name}}
-        yield {**place, "name": f"{kind}_sort_index", "args": {"sort_index": number}}
-
-    def mark(phase: str, track: int, tick: int, **more: Any) -> TraceEvent:
-        return {"ph": phase, "pid": process, "tid": track, "ts": shown_ns(tick) / 1000, **more}
-
-    def span(track: int, name: str, start: int, end: int, **details: Any) -> TraceEvent:
-        length_ns = shown_ns(end) - shown_ns(start)
-        return mark("X", track, start, dur=length_ns / 1000, name=name, args=details)
-
-    yield from named("process", process, run.recording.name)
-    camera, tracker = next(tracks), next(tracks)
-    yield from named("thread", camera, "camera")
+    yield from events.named("process", process, run.recording.name)
+    camera = events.track()
+    yield from named(camera, "camera")
     processed = set(schedule.frames.tolist())
     for frame in range(schedule.length):
         skipped = frame not in processed
@@ -149,11 +264,15 @@ def trace_events(
         details = {"frame": frame, "skipped": skipped, "tick": tick}
         name = f"skipped {frame}" if skipped else f"frame {frame}"
         yield span(camera, name, tick, clock.arrival(frame + 1), **details)
-    yield from named("thread", tracker, "tracker")
     start, ready = schedule.start.tolist(), schedule.ready.tolist()
-    for frame, begin, end in zip(schedule.frames.tolist(), start, ready):
-        details = {"frame": frame, "start_ticks": begin, "ready_ticks": end}
-        yield span(tracker, f"frame {frame}", begin, end, **details)
+    if schedule.visible is not None:  # only those of pipelines are later than they are ready
+        calls = yield from _pipeline_events(events, schedule)
+    else:
+        tracker = events.track()
+        calls = dict.fromkeys(schedule.frames.tolist(), tracker)
+        yield from named(tracker, "tracker")
+        for frame, begin, end in zip(calls, start, ready):
+            yield span(tracker, f"frame {frame}", begin, end, **_call(frame, begin, end))
 
     free = pairings[0].first[:, 0]
     for cost_ns in dict.fromkeys(costs.values()):
@@ -163,17 +282,17 @@ def trace_events(
         spans = [(k, int(pairing.frames[k]), int(first[k]), int(end_frame[k])) for k in used]
         names = [name for name, cost in costs.items() if cost == cost_ns]
         for name in names:
-            track = next(tracks)
-            yield from named("thread", track, f"forecaster {name}")
+            track = events.track()
+            yield from named(track, f"forecaster {name}")
             for k, source, begin, end in spans:
                 details = {"source_frame": source, "tick": query(begin)}
                 if cost_ns:
                     details |= {"cost_ns": cost_ns, "delayed_queries": begin - int(free[k])}
                 state = f"update {source}" if source else "initial box"
                 yield span(track, state, query(begin), query(end), **details)
-        track = next(tracks)
+        track = events.track()
         shared = len(names) == len(costs)
-        yield from named("thread", track, "queries" if shared else f"queries {', '.join(names)}")
+        yield from named(track, "queries" if shared else f"queries {', '.join(names)}")
         for k, source, begin, end in spans:
             for frame in range(begin, end):
                 details = {"frame": frame, "source_frame": source, "age_frames": frame - source}
@@ -182,5 +301,5 @@ def trace_events(
                 yield span(track, answer, query(frame), query(frame + 1), **details)
                 if frame == begin and source:
                     flow = {"id": next(flows), "cat": "answer", "name": "answers"}
-                    yield mark("s", tracker, start[k], **flow)
+                    yield mark("s", calls[source], start[k], **flow)
                     yield mark("f", track, query(frame), bp="e", **flow)

@@ -30,6 +30,7 @@ from lae_sim.forecast.costs import cost_notes
 from lae_sim.learning.registry import load_forecaster
 from lae_sim.replay.latency import RandomSource
 from lae_sim.replay.names import kind_of, label_of
+from lae_sim.replay.pipeline import pipeline_document
 from lae_sim.replay.run import Repetitions, Run, RunBatch, Runs, replay_together
 from lae_sim.replay.search import SearchModel
 from lae_sim.replay.world import World
@@ -72,7 +73,7 @@ class Setting:
         passes: strided and gap passes; the world names them too.
         world: how the trace is replayed, of random times with their seed; conventions, forecasters
             and costs are the cells'.
-        code: of a user's own policy or latency, a digest of its file.
+        code: of a user's own policy or latency, or times in a pipeline, a digest of its file.
         first, count: which repetitions of a random latency; 0 and 1 of any other.
         sequences: those wanted; all if empty.
     """
@@ -136,7 +137,9 @@ class Setting:
 
     def document(self) -> dict[str, Any]:
         """Plain values of all that the rows depend on: labels and contents of files, not paths."""
+        pipeline = self.world.pipeline
         return {
+            **({} if pipeline is None else {"pipeline": pipeline_document(pipeline)}),
             **self.columns(),
             "trace": [self.trace.label, self.trace.digest],
             "timing": self.timing and [self.timing.label, self.timing.digest],
@@ -396,7 +399,8 @@ class Replayed:
     Attributes:
         setting: which trace, and how.
         runs: its runs, of random times those of one repetition.
-        engine: ``"batch"``, or ``"simpy"`` where the policy or the source of times knows no lanes.
+        engine: ``"batch"``, or ``"simpy"`` where the policy or the source of times knows no lanes,
+            or there is a pipeline.
     """
 
     setting: Setting
@@ -429,5 +433,7 @@ def replayed(setting: Setting, trace: Trace) -> Replayed:
     searches = None if name is None else load_forecaster(name)
     runs = setting.world.replay(trace, pre_forecaster=searches)
     times = runs.source(next(iter(runs.times)))
-    in_lanes = batchable([times], runs.policy) and runs.arrivals != "recorded"
+    in_lanes = (
+        batchable([times], runs.policy) and runs.arrivals != "recorded" and runs.pipeline is None
+    )
     return Replayed(setting, runs, "batch" if in_lanes else "simpy")

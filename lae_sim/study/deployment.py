@@ -18,7 +18,7 @@ from lae_sim.files import text_digest
 from lae_sim.forecast.base import AnyFactory, Hold
 from lae_sim.study.cells import Cell, replayed
 from lae_sim.study.records import Requirement
-from lae_sim.trace.file import Trace, held, read_trace
+from lae_sim.trace.file import Trace, read_held
 
 STEP = Fraction(1, 100)
 MOST = 1 << 13
@@ -97,7 +97,7 @@ class Curve:
 def measured(search: Search) -> Curve:
     """The mean AUC at as many scales as it takes to say where it is what is required."""
     setting = search.cell.setting
-    trace = held(read_trace(setting.trace.path, setting.sequences or None), HELD)
+    trace = read_held(setting.trace.path, setting.sequences or None, frames=HELD)
     found: dict[int, tuple[float, float | None, bool]] = {}
 
     def auc(step: int) -> float:

@@ -9,6 +9,7 @@ from itertools import product
 from pathlib import Path
 
 from lae_sim.comparison.forecasters import fitted
+from lae_sim.engine.pipeline import Pipeline
 from lae_sim.errors import LaeError
 from lae_sim.files import labels, text_digest
 from lae_sim.forecast.base import AnyFactory, Hold
@@ -17,6 +18,7 @@ from lae_sim.learning.folds import Trainer
 from lae_sim.learning.registry import base_name, files_named, load_any, load_forecaster
 from lae_sim.replay.names import named
 from lae_sim.replay.passes import passes_for
+from lae_sim.replay.pipeline import times_named
 from lae_sim.replay.run import check_rate
 from lae_sim.replay.world import World
 from lae_sim.study.cells import Cell, Input, Setting, Task
@@ -80,7 +82,7 @@ class Plan:
         read = {each.label: read_trace(each.path, wanted) for each in own}
         fixed = [name for name in study.times if not is_random(name)] or ["recorded"]
         worlds = World.sweep(
-            policy=study.policies[0],
+            policy=study.policies[0] if study.policies else "latest",
             fps=study.fps[0],
             latency=fixed,
             scale=study.scales,
@@ -156,14 +158,16 @@ def _settings(
 ) -> list[Setting]:
     """All ways in which a trace is replayed."""
     other_times = [other.input for other in timing if _same_runs(source, other)]
-    codes = {name: _own_code(name) for name in (*study.policies, *study.times)}
+    codes = {name: _own_code(name) for name in study.times}
+    rules: list[tuple[str, Pipeline | None]] = [(policy, None) for policy in study.policies]
+    rules += [("latest", pipeline) for pipeline in study.pipelines]
     searching = {name: "" if name is None else _file_code(name) for name in study.pre_forecaster}
     rates = dict.fromkeys(source.metadata.fps if fps is None else fps for fps in study.fps)
     found = []
     chunk = max(1, CHUNK_FRAMES // (max(source.frames, 1) * max(1, len(study.sigmas) // 8)))
-    for times, policy, fps, latency, scale, search, pre_forecaster in product(
+    for times, (policy, pipeline), fps, latency, scale, search, pre_forecaster in product(
         [None, *other_times],
-        study.policies,
+        rules,
         rates,
         study.times,
         study.scales,
@@ -182,13 +186,15 @@ def _settings(
             keep_size=study.keep_size and pre_forecaster is not None,
             sigmas=study.sigmas,
             forget_arrivals=study.forget_arrivals,
+            pipeline=pipeline,
         )
+        own = [policy] if pipeline is None else times_named(pipeline)
         setting = Setting(
             trace=source.input,
             timing=times,
             passes=tuple(each.input for each in passes),
             world=world,
-            code=codes[policy] + codes[latency] + searching[pre_forecaster],
+            code="".join(map(_own_code, own)) + codes[latency] + searching[pre_forecaster],
             first=0,
             count=1,
             sequences=tuple(sorted(study.sequences)),

@@ -160,7 +160,8 @@ class CellRows:
         values["sigma"] = np.tile(self._sigmas, len(replay.sequences))
         rows = len(values["sigma"])
         columns = {
-            **{name: pa.repeat(text, rows) for name, text in self._about.items()},
+            # not pa.repeat, which imports pandas
+            **{name: from_texts([text], rows) for name, text in self._about.items()},
             "sequence": from_texts(replay.sequences, count),
             **{name: from_numpy(column.astype(COLUMNS[name])) for name, column in values.items()},
         }

@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -23,6 +22,7 @@ from lae_sim.evaluation.caveats import at_the_floor, floor_notes
 from lae_sim.files import check_distinct, csv_cell, text_digest, written_whole
 from lae_sim.forecast.base import AnyFactory
 from lae_sim.learning.registry import files_named
+from lae_sim.replay.pipeline import times_named
 from lae_sim.study.cells import Result, Task
 from lae_sim.study.comparisons import PairsFile, Rivals, rivals_of
 from lae_sim.study.deployment import Curve, Search, requirement, searches
@@ -138,18 +138,30 @@ class StudyResults:
         return pd.DataFrame(flat_rows(self.summary))
 
     def scores_frame(self) -> DataFrame:
-        """The summary with all numbers as numbers.
+        """The summary with all numbers as numbers: the table of :meth:`score_rows`."""
+        import pandas as pd
+
+        return pd.DataFrame(self.score_rows(), columns=self.score_names())
+
+    def score_names(self) -> list[str]:
+        """The columns of :meth:`score_rows`."""
+        flat = (record.flat() for record in self.summary)
+        return [*dict.fromkeys(chain.from_iterable(flat)), "over_sigmas"]
+
+    def score_rows(self) -> Iterator[dict[str, Any]]:
+        """The rows of the summary with all numbers as numbers.
 
         World rates and scales are floats, and so is sigma, which is unknown where scores are means
         over the grid of sigmas; ``over_sigmas`` says so.
         """
-        table = self.summary_frame()
-        numbers = {
-            name: [float(Fraction(text)) for text in table[name]] for name in ("fps", "scale")
-        }
-        over = table["sigma"] == MEAN
-        sigma = [math.nan if text == MEAN else float(Fraction(text)) for text in table["sigma"]]
-        return table.assign(**numbers, sigma=sigma, over_sigmas=over)
+        for record in self.summary:
+            over = record.sigma == MEAN
+            numbers = {
+                "fps": float(record.fps),
+                "scale": float(record.scale),
+                "sigma": math.nan if over else float(record.sigma),
+            }
+            yield {**record.flat(), **numbers, "over_sigmas": over}
 
     def __repr__(self) -> str:
         cells, failed = len(self.plan.cells), len(self.failures)
@@ -291,7 +303,8 @@ def compute_study(
         LaeError: if the study cannot be planned, nothing could be computed, or a worker died.
     """
     plan = make_plan(study, base)
-    names = (*study.forecasters, *filter(None, study.pre_forecaster), *study.policies, *study.times)
+    names = [*study.forecasters, *filter(None, study.pre_forecaster), *study.policies]
+    names += [*study.times, *(time for each in study.pipelines for time in times_named(each))]
     files = [file for name in names for file in files_named(name)]
     check_inputs(folder, [*(source.input.path for source in plan.sources), *files])
     store = Store(folder)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import difflib
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
 from lae_sim.decoding import read_toml
 from lae_sim.engine.clock import exact, parse_duration, parse_fps, split_init, whole
+from lae_sim.engine.pipeline import Pipeline
 from lae_sim.engine.scheduler import scores_latency
 from lae_sim.errors import LaeError, shown
 from lae_sim.evaluation.metrics import find_convention
@@ -26,8 +29,9 @@ from lae_sim.replay.names import (
     several,
     text,
 )
+from lae_sim.replay.pipeline import parse_pipeline, pipeline_document, read_pipeline
 from lae_sim.replay.search import parse_search
-from lae_sim.replay.world import check_sigmas, parse_sigmas
+from lae_sim.replay.world import World, check_sigmas, parse_sigmas
 from lae_sim.trace.file import Trace
 
 RANDOM = ("bootstrap", "resample", "lognormal")
@@ -48,6 +52,8 @@ class Study:
             the traces of its tracker and dataset.
         forecasters: names, as on command lines; hold is always there.
         policies: which frame a free tracker takes.
+        pipelines: stages around the tracker, besides the policies; in Python by their names, as
+            pipelines, tables of their keys, or paths of files of these.
         fps: world frame rates; None is each trace's own.
         forget_arrivals: whether frames arrive evenly also where a trace says when each of them did.
         latencies: where times come from: ``"recorded"``, ``"by-call"``, ``"constant:47ms"``, or one
@@ -85,6 +91,7 @@ class Study:
     passes: tuple[str, ...] = ()
     forecasters: tuple[str, ...] = ("hold", "kalman")
     policies: tuple[str, ...] = ("latest",)
+    pipelines: tuple[Pipeline, ...] = ()
     fps: tuple[Fraction | None, ...] = (None,)
     latencies: tuple[str, ...] = ("recorded",)
     init: tuple[str, ...] = ()
@@ -113,9 +120,16 @@ class Study:
             raise LaeError(f"repetitions: {self.repetitions} are too many: at most a million")
         for latency in self.latencies:
             _check_latency(latency, swept=bool(self.init))
+        if not self.policies and not self.pipelines:
+            raise LaeError("policies: the list is empty, and there are no pipelines")
         for policy in self.policies:
             if not scores_latency(parse_policy(policy)):
                 raise LaeError(f"policies: {policy} never scores latency: it goes with replay")
+        for pipeline, latency in product(self.pipelines, self.times):
+            try:
+                World(latency=self.seeded(latency), pipeline=pipeline)
+            except LaeError as error:
+                raise LaeError(f"pipelines: {pipeline.name}: {error}") from error
         for cost in self.costs:
             if cost.rpartition("=")[2] == "measured":
                 raise LaeError("costs: declare a time: one measured would differ on every worker")
@@ -203,11 +217,47 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     document = read_toml(path, "a study")
     try:
         with looking_in(Path(path).parent):
-            return Study.of(document)
+            return Study.of(_beside(document, Path(path).parent))
     except RecursionError as error:
         raise LaeError(f"{path}: is nested too deeply for a study") from error
     except (ValueError, LaeError) as error:  # ValueError also of a number of thousands of digits
         raise LaeError(f"{path}: {error}") from error
+
+
+def _beside(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A study's table, with paths of pipelines from its folder."""
+    found = dict(document)
+    if isinstance(given := found.get("pipelines"), Mapping):
+        found["pipelines"] = {
+            name: folder / value if isinstance(value, str) else value
+            for name, value in given.items()
+        }
+    return found
+
+
+def _pipelines(value: Any) -> tuple[Pipeline, ...]:
+    """Pipelines by name, in plain values, or as they are."""
+    if isinstance(value, Mapping):
+        made = [named(str(name), partial(_pipeline, name=name), it) for name, it in value.items()]
+    else:
+        made = [_pipeline(each) for each in several(value)]
+    for name, count in Counter(each.name for each in made).items():
+        if count > 1:
+            raise LaeError(f"two are called {name!r}: give them names of their own")
+    return tuple(made)
+
+
+def _pipeline(value: Any, name: str | None = None) -> Pipeline:
+    if isinstance(value, Mapping):
+        value = parse_pipeline(value, name or "pipeline")
+    elif not isinstance(value, Pipeline):
+        value = read_pipeline(value)
+    named_so = value if name is None else replace(value, name=name)
+    return parse_pipeline(pipeline_document(named_so))  # which refuses what has no name
+
+
+def _policies(value: Any) -> tuple[str, ...]:
+    return () if value in ([], ()) else _several(text)(value)
 
 
 def _check_latency(latency: str, swept: bool) -> None:
@@ -233,6 +283,8 @@ def _meant(key: str) -> str:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, Pipeline):
+        return pipeline_document(value)
     if isinstance(value, tuple):
         return [_plain(each) for each in value]
     return str(value) if isinstance(value, Fraction) else value
@@ -281,7 +333,8 @@ _KEYS: Mapping[str, tuple[str, Callable[[Any], Any]]] = {
     "timing": ("timing", _several(_trace)),
     "passes": ("passes", _several(_trace)),
     "forecasters": ("forecasters", _several(text)),
-    "policies": ("policies", _several(text)),
+    "policies": ("policies", _policies),
+    "pipelines": ("pipelines", _pipelines),
     "fps": ("fps", _several(_rate)),
     "forget_arrivals": ("forget_arrivals", flag),
     "latencies": ("latencies", _several(text)),

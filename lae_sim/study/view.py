@@ -125,8 +125,6 @@ class View:
         At the first sigma and the settings that stand for all, after a column ``dataset``; None if
         there are no attributes or the study wants none.
         """
-        import pandas as pd
-
         study, parts = self.results.plan.study, []
         scored = self.results.scores if study.attributes else ()
         groups: dict[str, list[Scores]] = {}
@@ -140,6 +138,8 @@ class View:
                 for sequence in s.sequences
             }
             if any(attributes.values()):
+                import pandas as pd
+
                 table = pd.DataFrame([row for scores in group for row in self._tidy(scores)])
                 try:
                     found = by_attribute(
@@ -148,7 +148,9 @@ class View:
                 except LaeError:
                     continue  # no sequence has a score of every forecaster
                 parts.append(found.assign(dataset=visible(dataset)))
-        return pd.concat(parts, ignore_index=True) if parts else None
+        if not parts:
+            return None
+        return pd.concat(parts, ignore_index=True)
 
     def _tidy(self, scores: Scores) -> Iterable[dict[str, str | float]]:
         """The AUC of each sequence, as :mod:`lae_sim.comparison.statistics` wants it."""

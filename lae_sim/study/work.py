@@ -15,7 +15,7 @@ from lae_sim.study.comparisons import Rivals
 from lae_sim.study.deployment import Search, measured
 from lae_sim.study.records import Failure
 from lae_sim.study.rows import RowsFile
-from lae_sim.trace.file import Trace, held, read_trace
+from lae_sim.trace.file import Trace, read_held
 from lae_sim.trace.locate import digest, stamp
 
 
@@ -153,7 +153,7 @@ class _Traces:
         """A trace, which is read once."""
         key = trace, sequences
         if key not in self._read:
-            self._read[key] = held(read_trace(trace.path, sequences or None))
+            self._read[key] = read_held(trace.path, sequences or None)
         return self._read[key]
 
 

@@ -1,4 +1,4 @@
-from .file import Trace, held, read_trace, validate, write_trace
+from .file import Trace, read_held, read_trace, validate, write_trace
 from .locate import find_traces
 from .metadata import ImageSizes, Metadata
 from .recording import Recording, batched
@@ -10,7 +10,7 @@ __all__ = [
     "Trace",
     "batched",
     "find_traces",
-    "held",
+    "read_held",
     "read_trace",
     "validate",
     "write_trace",

@@ -222,6 +222,27 @@ def from_texts(texts: Sequence[str], times: int = 1) -> Any:
     return pa.Array.from_buffers(pa.string(), len(sizes), buffers)
 
 
+def from_values(values: Sequence[Any], kind: Any) -> Any:
+    """An Arrow array of plain values of one type; null where one is None.
+
+    Args:
+        values: of that type each, or None.
+        kind: Arrow's string, bool, int64, float64 or null.
+    """
+    import pyarrow as pa
+
+    valid = np.array([value is not None for value in values], np.bool_)
+    if kind == pa.null():
+        return pa.nulls(len(values))
+    if kind == pa.string():
+        texts = from_texts(["" if value is None else value for value in values])
+        bitmap = pa.py_buffer(np.packbits(valid, bitorder="little").tobytes())
+        buffers = [None if valid.all() else bitmap, *texts.buffers()[1:]]
+        return pa.Array.from_buffers(kind, len(values), buffers)
+    dtype = {pa.bool_(): np.bool_, pa.int64(): np.int64, pa.float64(): np.float64}[kind]
+    return from_numpy(np.array([0 if value is None else value for value in values], dtype), valid)
+
+
 def to_numpy(array: Any, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     """The values of a primitive Arrow array; what stands where it is null is arbitrary."""
     data = array.buffers()[1]

@@ -148,22 +148,27 @@ def read_trace(path: str | os.PathLike[str], sequences: str | Iterable[str] | No
     """
     if not isinstance(path, (str, os.PathLike)):
         raise LaeError(f"path: a trace is read from a path or a URL, not {shown(path)}")
-    stored = _StoredRecordings(os.fspath(path))
-    metadata, rows, columns = stored.describe()
-    stored = replace(stored, profiled=metadata.profiled, restarts=metadata.kind == "restarts")
-    trace = Trace(metadata, stored, rows, columns)
-    return trace if sequences is None else trace.chosen(sequences)
+    return _StoredRecordings(os.fspath(path)).trace(sequences)
 
 
-def held(trace: Trace, frames: int = HELD_FRAMES) -> Trace:
-    """The trace, kept in memory from the start if it has at most so many world frames.
+def read_held(
+    path: str | os.PathLike[str],
+    sequences: Iterable[str] | None = None,
+    frames: int = HELD_FRAMES,
+) -> Trace:
+    """The same, with the recordings in memory if these have at most so many world frames.
 
     Raises:
         TraceError: if it is not a valid trace.
+        LaeError: as :func:`read_trace`.
     """
-    if trace.frames is None or trace.frames > frames:
-        return trace
-    return replace(trace, recordings=list(trace))
+    stored = _StoredRecordings(os.fspath(path))
+    with stored.opened() as file:  # once for all that is read of it
+        trace = replace(stored, file=file).trace(sequences)
+        if trace.frames is not None and trace.frames <= frames:
+            # (a list of the trace itself would ask for its length first)
+            return replace(trace, recordings=list(trace.recordings))
+    return stored.trace(sequences)
 
 
 def validate(path: str | os.PathLike[str]) -> None:
@@ -296,16 +301,31 @@ def check_replaces(path: str | os.PathLike[str], tracker: str, dataset: str) -> 
 
 @dataclass(frozen=True)
 class _StoredRecordings:
-    """The recordings of a file, read anew on each iteration."""
+    """The recordings of a file, read anew on each iteration.
+
+    Attributes:
+        path: of the file.
+        keep: names of the sequences; None for all.
+        profiled, restarts: see :class:`RowChecker`.
+        file: itself, while somebody has it open; otherwise it is opened each time.
+    """
 
     path: str
     keep: frozenset[str] | None = None
     profiled: bool = False
     restarts: bool = False
+    file: Any = None
+
+    def trace(self, sequences: str | Iterable[str] | None) -> Trace:
+        """The trace of the file, with some of its sequences or all."""
+        metadata, rows, columns = self.describe()
+        stored = replace(self, profiled=metadata.profiled, restarts=metadata.kind == "restarts")
+        trace = Trace(metadata, stored, rows, columns)
+        return trace if sequences is None else trace.chosen(sequences)
 
     def describe(self) -> tuple[Metadata, int, frozenset[str]]:
         """The file's metadata, its number of rows, and the optional columns that it has."""
-        with self._opened() as file:
+        with self.opened() as file:
             check_schema(file.schema_arrow, self.path)
             stored = (file.schema_arrow.metadata or {}).get(b"lae_sim")
             if stored is None:
@@ -327,7 +347,7 @@ class _StoredRecordings:
             LaeError: if one that is to be kept is not there.
         """
         found: dict[str, int] = {}
-        with self._opened() as file:
+        with self.opened() as file:
             self._check_sizes(file.metadata.row_group(g) for g in range(file.num_row_groups))
             for batch in file.iter_batches(2 * BATCH_ROWS, columns=["sequence"], use_threads=False):
                 for each in batch.column(0).value_counts().to_pylist():
@@ -377,7 +397,7 @@ class _StoredRecordings:
         yield _joined(parts)
 
     def _rows(self) -> Iterator[Rows]:
-        with self._opened() as file:
+        with self.opened() as file:
             there = file.schema_arrow.names
             present = [name for name in there if name in COLUMN_TYPES or is_optional(name)]
             groups = [file.metadata.row_group(g) for g in range(file.num_row_groups)]
@@ -400,10 +420,14 @@ class _StoredRecordings:
                 budget.take(max(column.total_uncompressed_size for column in columns))
 
     @contextmanager
-    def _opened(self) -> Iterator[Any]:
+    def opened(self) -> Iterator[Any]:
+        """The file, open."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
+        if self.file is not None:
+            yield self.file
+            return
         try:
             with (
                 opened(self.path) as source,

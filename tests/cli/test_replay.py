@@ -688,6 +688,24 @@ def test_several_pipelines_stand_side_by_side(tmp_path):
     assert "pipeline:ten" in printed.split("\n\n")[0]
 
 
+def test_where_the_time_goes_is_drawn(tmp_path):
+    drone = tmp_path / "drone.toml"
+    drone.write_text(DRONE.replace('"6ms"', '"36ms"'))
+    asked = ["--pipeline", drone, "--sequence", "boat-calm"]
+    printed = replay(FAST, *asked, "--waterfall", tmp_path / "why.svg", "--out", tmp_path / "out")
+    assert (
+        "gpu is too slow: each frame needs it, decode for 36.0 ms and tracker for 20.0 ms:"
+        in printed
+    )
+    assert "gpu is too slow" in (tmp_path / "why.svg").read_text()
+    assert (tmp_path / "out" / "figures" / "waterfall.pdf").exists()
+    done = run_here("replay", FAST, "--waterfall", tmp_path / "no.svg")
+    assert (done.returncode, "--waterfall is of the stages of a --pipeline" in done.stderr) == (
+        2,
+        True,
+    )
+
+
 def test_a_pipeline_s_mistakes_name_file_stage_and_key(tmp_path):
     drone = tmp_path / "drone.toml"
     drone.write_text(DRONE.replace('"6ms"', '"6"'))

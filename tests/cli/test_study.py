@@ -214,6 +214,56 @@ def test_the_summary_has_the_means_of_replay(tmp_path: Path) -> None:
     assert "auc_low" not in rows["synthetic-slow", "hold", "1/50"]
 
 
+LATE = lae_sim.Pipeline(
+    [lae_sim.Stage("decode", "6ms"), lae_sim.Stage("tracker", queue=3)],
+    camera=lae_sim.Camera(delivery="8ms", jitter="uniform:0ms-8ms:1", drops=[7]),
+    name="late",
+)
+
+
+def test_pipelines_stand_beside_the_policies_as_replay_has_them(tmp_path: Path) -> None:
+    pipelines = {"late": LATE, "two": {"stages": [{"name": "tracker", "workers": 2}]}}
+    study = Study((str(SLOW), str(FAST)), sequences=FEW, pipelines=pipelines, sigmas=(0, 1))
+    results = run(tmp_path, study)
+    found = lae_sim.evaluate(
+        [SLOW, FAST], sequences=FEW, sigma=[0, 1], policy="latest", search="trace"
+    ).summary
+    piped = lae_sim.evaluate(
+        [SLOW, FAST], sequences=FEW, sigma=[0, 1], pipeline=list(study.pipelines)
+    ).summary
+    expected = {
+        (row.trace.removesuffix(".parquet"), row.policy, row.forecaster, row.sigma): row
+        for row in pd.concat([found, piped]).itertuples()
+    }
+    rows = [row for row in results.summary if row.sigma != lae_sim.study.records.MEAN]
+    assert {row.policy for row in rows} == {"latest", "pipeline:late", "pipeline:two"}
+    assert len(rows) == len(expected) == 24
+    for row in rows:
+        same = expected[row.trace, row.policy, row.forecaster, float(row.sigma)]
+        assert row.scores["auc"] == pytest.approx(same.auc)
+        assert row.scores["dp20"] == pytest.approx(same.dp20)
+        assert row.staleness is not None  # LAE's, not that from the capture on
+        assert row.staleness.age_ms == pytest.approx(same.age_ms)
+
+
+def test_another_pipeline_of_the_same_name_is_computed_anew(tmp_path: Path) -> None:
+    def computed(queue: int) -> int:
+        text = f'[[stages]]\nname = "tracker"\ntime = "47ms"\nqueue = {queue}\n'
+        (tmp_path / "mine.toml").write_text(text)
+        path = tmp_path / "study.toml"
+        path.write_text(
+            f'traces = "{SLOW}"\nsequences = ["boat-calm"]\npolicies = []\n'
+            '[pipelines]\nmine = "mine.toml"\n'
+        )
+        study = lae_sim.read_study(path)
+        results = compute_study(study, tmp_path / "out", tmp_path, workers=1)
+        (hold,) = (row for row in results.summary if row.forecaster == "hold")
+        assert hold.policy == "pipeline:mine"
+        return results.computed
+
+    assert [computed(1), computed(1), computed(10), computed(1)] == [2, 0, 2, 0]
+
+
 def test_success_and_precision_curves_are_kept(tmp_path: Path) -> None:
     results = run(tmp_path)
     for scores in results.scores:

@@ -92,7 +92,7 @@ def test_the_event_driven_witness_agrees(world: Piped) -> None:
     assert at(schedule.delivered) == witness.delivered
     assert list(schedule.stages) == [stage.name for stage in world.stages]
     for (name, log), passages in zip(schedule.stages.items(), witness.log):
-        for what in ("arrived", "taken", "started", "finished", "left"):
+        for what in ("arrived", "taken", "started", "finished", "left", "gone"):
             expected = [getattr(passage, what) for passage in passages]
             assert at(getattr(log, what)) == expected, (name, what)
         assert [Drop(each).name for each in log.dropped.tolist()] == [

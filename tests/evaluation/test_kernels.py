@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -14,14 +15,16 @@ from hypothesis import strategies as st
 
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import every, latest, vot_realtime
-from lae_sim.evaluation.evaluate import Evaluation, evaluate_runs
+from lae_sim.evaluation.evaluate import Evaluation, evaluate_groups, evaluate_runs
 from lae_sim.evaluation.metrics import CONVENTIONS
 from lae_sim.evaluation.pairing import histories, pair, pairs
 from lae_sim.evaluation.scoring import Scorer
 from lae_sim.forecast.base import ConstantVelocity, Hold
 from lae_sim.forecast.kalman import Kalman
-from lae_sim.replay.run import Run, replay_sequence
-from lae_sim.replay.world import SIGMA_GRID
+from lae_sim.replay.latency import bootstrap
+from lae_sim.replay.run import Repetitions, Run, replay_sequence
+from lae_sim.replay.world import SIGMA_GRID, replay_trace
+from lae_sim.trace.file import Trace
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
@@ -101,6 +104,45 @@ def test_evaluations_are_the_same(some: list[Run], sigmas: Sequence[Fraction], n
     assert found[0] == found[1]
 
 
+@given(
+    seed=st.integers(0, 2**32),
+    sigmas=st.sampled_from(SIGMAS),
+    name=st.sampled_from(sorted(CONVENTIONS)),
+)
+@settings(max_examples=30, deadline=None)
+def test_repetitions_that_share_what_pairs_count_are_the_same(
+    seed: int, sigmas: Sequence[Fraction], name: str
+) -> None:
+    random = np.random.default_rng(seed)
+    some = [recording(f"s{s}", random, False) for s in range(4)]
+    trace = Trace(Metadata.new("30", "every-frame"), some)
+    drawn = Repetitions(replay_trace(trace, latency=bootstrap(1, block=3), search="off"), 5)
+    assert all(batch.own.all() for batch in drawn.batches())
+
+    found = []
+    for way in ("0", "1"):
+        with switched(way):
+            groups = evaluate_groups(
+                drawn, trace.metadata, {"hold": Hold}, sigmas, CONVENTIONS[name], frames=2000
+            )
+            found.append([list(flat(group)) for group in groups])
+    assert found[0] == found[1]
+
+
+def test_boxes_of_another_pass_are_not_taken_for_the_recordings_own() -> None:
+    random = np.random.default_rng(7)
+    own, other = (recording("a", random, False) for _ in range(2))
+    other = replace(own, boxes=own.boxes + 3.0)
+    metadata = Metadata.new("30", "every-frame")
+    strided = Metadata.new("30", "every-frame", schedule={"stride": "2"})
+    trace, second = Trace(metadata, [own]), Trace(strided, [other])
+    found: list[bool] = []
+    for latency in ("constant:1ms", "constant:60ms"):
+        runs = replay_trace(trace, latency=latency, passes=[second], search="off")
+        found += [bool(batch.own[0]) for batch in runs.batches()]
+    assert found == [True, False]
+
+
 @given(some=runs(), sigmas=st.sampled_from(SIGMAS))
 @settings(max_examples=50, deadline=None)
 def test_pairs_are_the_same(some: list[Run], sigmas: Sequence[Fraction]) -> None:
@@ -138,7 +180,9 @@ def test_kernels_are_what_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(5)
     some = [replay_sequence(recording("a", random, False), CLOCK)]
     used = []
-    names = ("sum_gaps", "changes", "used_outputs", "most_pairs", "list_pairs", "count_pairs")
+    counting = ("count_pairs", "count_held")
+    names = ("sum_gaps", "changes", "used_outputs", "most_pairs", "list_pairs", *counting)
+    both = {"hold": Hold, "kalman": Kalman}
     for name in names:
         kernel = getattr(kernels, name)
 
@@ -149,5 +193,5 @@ def test_kernels_are_what_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(kernels, name, noted)
     for way, expected in (("0", 0), ("1", len(names))):
         with switched(way):
-            evaluate_runs(some, Metadata.new("30", "every-frame"), {"kalman": Kalman}, SIGMA_GRID)
+            evaluate_runs(some, Metadata.new("30", "every-frame"), both, SIGMA_GRID)
         assert len(set(used)) == expected

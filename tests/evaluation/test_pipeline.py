@@ -76,9 +76,98 @@ def test_resources_and_answers_that_are_overtaken() -> None:
     ]
     found = report(Pipeline(stages, resources={"gpu": 2}))["pipeline"]
     assert found["resources"] == [
-        {"resource": "gpu", "capacity": 2, "utilisation": pytest.approx(6 * 10 / (2 * 240))}
+        {
+            "resource": "gpu",
+            "capacity": 2,
+            "load": pytest.approx(6 * 10 / (2 * 240)),
+            "utilisation": pytest.approx(6 * 10 / (2 * 240)),
+        }
     ]
     assert (found["outputs"], found["overtaken"]) == (5, 1)
+
+
+def test_the_waterfall_adds_up_to_the_age_of_the_answers() -> None:
+    # answers 1, 3 and 4 (see above) wait 20, 0 and 20 ms for the tracker
+    steps = report(SLOW)["pipeline"]["waterfall"]
+    means = {(step["stage"], step["part"]): step["mean_ms"] for step in steps}
+    assert means == {
+        ("camera", "exposure"): 4,
+        ("camera", "delivery"): 6,
+        ("decode", "queue"): 0,
+        ("decode", "work"): 10,
+        ("tracker", "queue"): pytest.approx(40 / 3),
+        ("tracker", "work"): 60,
+        ("publish", "queue"): 0,
+        ("publish", "work"): 5,
+    }
+    assert steps[-1]["capture_age_ms"] == pytest.approx(sum(means.values()))
+    assert steps[-1]["capture_age_ms"] == pytest.approx((105 + 85 + 105) / 3)
+    waits = next(step for step in steps if step["stage"] == "tracker")
+    assert (waits["p95_ms"], waits["capture_age_p95_ms"]) == (pytest.approx(20), pytest.approx(40))
+
+
+def test_what_blocks_and_what_is_shared_has_its_place_in_the_waterfall() -> None:
+    stages = [
+        Stage("tracker", "10ms", resource="gpu"),
+        Stage("publish", "60ms", when_full="block"),
+    ]
+    steps = report(Pipeline(stages, resources={"gpu": 1}), length=12)["pipeline"]["waterfall"]
+    parts = [(step["stage"], step["part"]) for step in steps[2:]]
+    assert parts == [
+        ("tracker", "queue"), ("tracker", "resource"), ("tracker", "work"), ("tracker", "blocked"),
+        ("publish", "queue"), ("publish", "work"),
+    ]  # fmt: skip
+    assert steps[5]["mean_ms"] > 0
+    assert steps[-1]["capture_age_ms"] == pytest.approx(sum(step["mean_ms"] for step in steps))
+
+
+def slow(*stages: Stage, length: int = 100, **others: Any) -> tuple[str, str, float] | None:
+    """Kind, name and load of what is too slow, 40 ms a frame."""
+    found = report(Pipeline(stages, **others), length=length)["pipeline"]["bottleneck"]
+    return found and (found["kind"], found["name"], round(found["load"], 2))
+
+
+def test_the_first_stage_that_is_too_slow_is_named() -> None:
+    decode, publish = Stage("decode", "10ms"), Stage("publish", "5ms")
+    assert slow(decode, Stage("tracker", "38ms"), publish) is None
+    assert slow(decode, Stage("tracker", "50ms"), publish) == ("stage", "tracker", 1.25)
+    assert slow(decode, Stage("tracker", "50ms", workers=2), publish) is None
+    assert slow(decode, Stage("tracker", "50ms", queue=None)) == ("stage", "tracker", 1.25)
+    assert slow(decode, Stage("tracker", "90ms", every=2)) == ("stage", "tracker", 1.12)
+    both = Stage("decode", "50ms"), Stage("tracker", "60ms")
+    assert slow(*both) == ("stage", "decode", 1.25)
+
+
+def test_a_resource_that_is_too_slow_is_named_rather_than_a_stage_that_waits_for_it() -> None:
+    stages = Stage("decode", "15ms", resource="core"), Stage("tracker", "29ms", resource="core")
+    assert slow(*stages, resources={"core": 1}) == ("resource", "core", 44 / 40)
+    assert slow(*stages, resources={"core": 2}) is None
+
+
+def test_of_stages_that_block_each_other_the_one_that_is_slow_is_named() -> None:
+    stages = (
+        Stage("decode", "5ms"),
+        Stage("tracker", "10ms", when_full="block"),
+        Stage("forecaster", "5ms", when_full="block"),
+        Stage("publish", "60ms", when_full="block"),
+    )
+    kind, name, load = slow(*stages) or ("", "", 0)
+    assert (kind, name, load) == ("stage", "publish", pytest.approx(1, abs=0.1))
+
+
+def test_bursts_are_no_slow_stage() -> None:
+    times = [200, *[10] * 99]
+    stage = Stage("tracker", lambda recording: lambda frame: times[frame % 50] * 10**6)
+    assert slow(stage) == ("bursts", "tracker", 0.3)  # 4 frames are lost, twice
+    text = report(Pipeline([stage]), length=100)["pipeline"]["bottleneck"]["text"]
+    assert text.startswith("tracker loses 8 of 100 frames, though they are 30% of what it can do")
+    assert "200.0 ms at most" in text
+
+
+def test_an_initialisation_makes_no_stage_slow() -> None:
+    times = [900, *[30] * 99]
+    stage = Stage("tracker", lambda recording: lambda frame: times[frame] * 10**6)
+    assert slow(stage) == ("bursts", "tracker", 0.75)
 
 
 def test_sequences_add_up() -> None:

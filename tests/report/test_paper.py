@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pyarrow.parquet as pq
@@ -18,10 +20,12 @@ from lae_sim.report.paper import (
     MOST_ROWS,
     Paper,
     PaperTable,
+    Records,
     TrackerScores,
     in_two_forms,
     remove_paper,
     with_and_without,
+    write_frame,
     write_paper,
     write_table,
 )
@@ -196,3 +200,19 @@ def test_labels_that_do_not_differ_are_in_the_caption(tmp_path: Path) -> None:
     assert r"\caption{Some; dataset D.}" in text
     assert r"tracker & AUC \\" in text
     assert (tmp_path / "t.csv").read_text().startswith("tracker,dataset,auc\n")
+
+
+def test_records_are_written_as_a_frame_of_them_would_be(tmp_path: Path) -> None:
+    some: list[dict[str, Any]] = [
+        {"name": "=1+2", "whole": 3, "partly": 1, "real": 0.1, "is": True, "empty": None},
+        {"name": "b", "whole": 4, "real": math.nan, "is": False, "late": "x", "empty": None},
+    ]
+    rows = some * 700  # more than are held at once
+    names = ["name", "whole", "partly", "real", "is", "empty", "late"]
+    frame = pd.DataFrame(rows, columns=names)
+    write_frame(frame, tmp_path / "frame")
+    write_frame(Records(names, lambda: iter(rows)), tmp_path / "records")
+    texts = [(tmp_path / f"{name}.csv").read_bytes() for name in ("frame", "records")]
+    assert texts[0] == texts[1]
+    read = [pd.read_parquet(tmp_path / f"{name}.parquet") for name in ("frame", "records")]
+    pd.testing.assert_frame_equal(*read)

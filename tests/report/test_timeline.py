@@ -1,5 +1,5 @@
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from fractions import Fraction
 from itertools import pairwise
 
@@ -17,6 +17,7 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import every, fifo, latest
 from lae_sim.evaluation.evaluate import evaluate_groups
 from lae_sim.report.timeline import timeline_file, trace_events
+from lae_sim.trace.file import Trace
 
 SLOW = REPOSITORY / "traces" / "synthetic-slow.parquet"
 COSTS = {"hold": 0, "kalman": 0, "slow": 25_000_000}
@@ -55,6 +56,8 @@ SCHEMA = {
                     _event("X", {**_PLACE, **_TIME, "dur": {"type": "number", "minimum": 0}}),
                     _event("s", _FLOW),
                     _event("f", {**_FLOW, "bp": {"const": "e"}}),
+                    _event("i", {**_PLACE, **_TIME, "s": {"const": "t"}}, optional=()),
+                    _event("C", {**_PLACE, **_TIME}, optional=()),
                 ]
             },
         },
@@ -118,6 +121,100 @@ def test_a_declared_cost_delays_the_answers_of_its_forecaster_alone():
     found = tracks(trace_events(run((150, 40, 40, 40)), Fraction(0), {"slow": 70_000_000}))
     update = found["forecaster slow"][-1]["args"]
     assert (update["source_frame"], update["delayed_queries"]) == (1, 1)
+
+
+def piped(stages, length=5, fps=25, **others):
+    """A run through a pipeline, 40 ms a frame."""
+    boxes = np.zeros((length, 4))
+    recording = lae_sim.Recording.new("sequence", boxes, boxes, np.zeros(length, np.int64))
+    trace = Trace(lae_sim.Metadata.new(str(fps), "every-frame"), [recording])
+    (replayed,) = lae_sim.replay_trace(trace, pipeline=lae_sim.Pipeline(stages, **others))
+    return replayed
+
+
+def instants(events, kind):
+    """Instants or counts of each named track: what, and when in ms."""
+    names, found = {}, defaultdict(list)
+    for event in events:
+        if event["name"] == "thread_name":
+            names[event["tid"]] = event["args"]["name"]
+        elif event["ph"] == kind:
+            name = names.get(event["tid"], event["name"])
+            what = event["name"] if kind == "i" else event["args"]["frames"]
+            found[name].append((what, event["ts"] / 1000))
+    return found
+
+
+def test_a_pipeline_s_tracks_are_its_workers_resources_and_queues():
+    # decoder and tracker need the core for 10 and 45 ms of each frame; two workers publish it in
+    # 50 ms, of which one is enough; frame 3 is lost on its way
+    stages = [
+        lae_sim.Stage("decode", "10ms", resource="core"),
+        lae_sim.Stage("tracker", "45ms", resource="core", priority=-1),
+        lae_sim.Stage("publish", "50ms", workers=2),
+    ]
+    camera = lae_sim.Camera(delivery="5ms", drops=[3])
+    events = list(trace_events(piped(stages, camera=camera, resources={"core": 1}), 0, {"hold": 0}))
+    document = {"displayTimeUnit": "ms", "otherData": {}, "traceEvents": events}
+    jsonschema.validate(document, SCHEMA)
+    story = {
+        name: [(s["name"], s["ts"] / 1000, (s["ts"] + s["dur"]) / 1000) for s in slices]
+        for name, slices in tracks(events).items()
+    }
+    del story["camera"], story["forecaster hold"]
+    assert story == {
+        "decode": [
+            ("frame 0", 5, 15), ("1 waits for core", 45, 60), ("frame 1", 60, 70),
+            ("2 waits for core", 85, 115), ("frame 2", 115, 125), ("4 waits for core", 165, 170),
+            ("frame 4", 170, 180),
+        ],
+        "tracker": [
+            ("frame 0", 15, 60), ("frame 1", 70, 115), ("frame 2", 125, 170), ("frame 4", 180, 225),
+        ],
+        "publish 1": [("frame 1", 115, 165), ("frame 2", 170, 220), ("frame 4", 225, 275)],
+        "core": [
+            ("decode 0", 5, 15), ("tracker 0", 15, 60), ("decode 1", 60, 70),
+            ("tracker 1", 70, 115), ("decode 2", 115, 125), ("tracker 2", 125, 170),
+            ("decode 4", 170, 180), ("tracker 4", 180, 225),
+        ],
+        "queries": [
+            ("0 answers 0", 0, 40), ("0 answers 1", 40, 80), ("0 answers 2", 80, 120),
+            ("0 answers 3", 120, 160), ("0 answers 4", 160, 200),
+        ],
+    }  # fmt: skip
+    assert instants(events, "i") == {
+        "delivery": [
+            ("delivered 0", 5), ("delivered 1", 45), ("delivered 2", 85), ("lost 3", 120),
+            ("delivered 4", 165),
+        ]
+    }  # fmt: skip
+
+
+def test_drops_are_instants_and_queues_are_counted():
+    # the tracker takes 0 at 0 ms, 2 at 90 ms and 4 at 180 ms; 2 pushes 1 out, and 4 pushes 3 out
+    stages = [lae_sim.Stage("tracker", "90ms")]
+    events = list(trace_events(piped(stages), 0, {}))
+    assert instants(events, "i")["tracker: dropped"] == [
+        ("1: queue full", 80), ("3: queue full", 160),
+    ]  # fmt: skip
+    counts = instants(events, "C")["tracker: queue"]
+    assert counts == [(0, 0), (1, 40), (1, 80), (0, 90), (1, 120), (1, 160), (0, 180)]
+
+
+def test_workers_and_blocked_frames_have_tracks_of_their_own():
+    stages = [
+        lae_sim.Stage("tracker", "30ms", workers=2),
+        lae_sim.Stage("publish", "100ms", when_full="block"),
+    ]
+    events = list(trace_events(piped(stages, 9), 0, {}))
+    found = tracks(events)
+    names = [s["name"] for s in found["tracker 1"]]
+    assert names[:2] == ["frame 0", "frame 1"]
+    blocked = [s for s in found["tracker 1"] if s["name"].endswith("is blocked")]
+    assert [(s["name"], s["ts"] / 1000) for s in blocked][:1] == [("3 is blocked", 150)]
+    for slices in found.values():  # of one worker, none overlaps
+        for before, after in pairwise(slices):
+            assert before["ts"] + before["dur"] <= after["ts"]
 
 
 @given(
@@ -231,6 +328,28 @@ def test_perfetto_loads_every_slice_and_flow(written):
     assert len(flows) == sum(e["ph"] == "f" for e in events) > 800
     for row in flows:
         assert row["output"].removeprefix("frame ") == row["answer"].split()[0]
+
+
+def test_perfetto_loads_the_tracks_of_a_pipeline(tmp_path):
+    path = tmp_path / "out.json"
+    options = ("--sequence", "boat-calm", "--latency", "constant:47ms")
+    replay(SLOW, *options, "--pipeline", SLOW.with_name("pipeline.toml"), "--timeline", path)
+    events = json.loads(path.read_text())["traceEvents"]
+    slices, counts, errors = queried(
+        path,
+        "SELECT t.name AS thread, count(*) AS n FROM slice s JOIN thread_track k "
+        "ON s.track_id = k.id JOIN thread t USING (utid) GROUP BY t.name",
+        "SELECT k.name AS name, count(*) AS n FROM counter c JOIN process_counter_track k "
+        "ON c.track_id = k.id GROUP BY k.name",
+        "SELECT name FROM stats WHERE value > 0 AND severity <> 'info'",
+    )
+    assert errors == []
+    expected = Counter(e["name"] for e in events if e["ph"] == "C")
+    assert {row["name"].removesuffix(" frames"): row["n"] for row in counts} == expected
+    names = {e["tid"]: e["args"]["name"] for e in events if e["name"] == "thread_name"}
+    shown = Counter(names[e["tid"]] for e in events if e["ph"] in "Xi")
+    assert {row["thread"]: row["n"] for row in slices} == shown
+    assert {"decode", "tracker", "tracker: dropped", "publish", "delivery"} < shown.keys()
 
 
 def test_a_picture_of_the_first_sequence(tmp_path):

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lae_sim.engine.pipeline import Camera, Pipeline, Stage
 from lae_sim.errors import LaeError
 from lae_sim.replay.world import SIGMA_GRID
 from lae_sim.study.spec import _KEYS, Study, read_study
@@ -50,6 +51,56 @@ def test_numbers_are_exact_as_they_are_written(tmp_path: Path) -> None:
     several = dataclasses.replace(study, require_auc=["0.5", 0.6])
     assert several.require_auc == (Fraction(1, 2), Fraction(3, 5))
     assert several.document()["require_auc"] == ["1/2", "3/5"]
+
+
+def test_pipelines_are_tables_or_files_beside_the_study(tmp_path: Path) -> None:
+    (tmp_path / "drone.toml").write_text('[[stages]]\nname = "tracker"\nqueue = "unbounded"\n')
+    text = """
+        traces = "a.parquet"
+        [pipelines]
+        drone = "drone.toml"
+        late = { camera = { delivery = "8ms" }, stages = [{ name = "tracker" }] }
+        """
+    study = read_study(written(tmp_path, text))
+    late = Pipeline([Stage("tracker")], camera=Camera(delivery="8ms"), name="late")
+    assert study.pipelines == (Pipeline([Stage("tracker", queue=None)], name="drone"), late)
+    assert Study(("a.parquet",), pipelines=study.pipelines) == study
+    plain = study.document()["pipelines"]
+    assert [each["name"] for each in plain] == ["drone", "late"]
+    assert Study.of({"traces": "a.parquet", "pipelines": plain}) == study
+
+
+@pytest.mark.parametrize(
+    ("pipelines", "words"),
+    [
+        ({"a": {"stages": []}}, "pipelines: a: stages: a pipeline has at least one"),
+        ({"a": {"stages": [{"name": "tracker", "queue": 0}]}}, "a: stage 'tracker': queue: 0"),
+        ("no.toml", "pipelines: no.toml"),
+        (7, "pipelines: pipeline: it is read from a TOML file, not 7"),
+        ([Pipeline([Stage("tracker")])] * 2, "two are called 'pipeline'"),
+        (Pipeline([Stage("tracker", lambda recording: int)]), "time: a function: name it, as"),
+    ],
+)
+def test_pipelines_that_are_none_are_refused(pipelines: Any, words: str) -> None:
+    with pytest.raises(LaeError) as caught:
+        Study(("a.parquet",), pipelines=pipelines)
+    assert words in str(caught.value)
+
+
+def test_the_tracker_s_time_is_the_latency_or_the_pipeline_s_own() -> None:
+    own = {"own": {"stages": [{"name": "tracker", "time": "30ms"}]}}
+    assert Study.of({"traces": "a", "pipelines": own, "latencies": "recorded"}).pipelines
+    with pytest.raises(LaeError) as caught:
+        Study.of({"traces": "a", "pipelines": own, "latencies": ["recorded", "bootstrap"]})
+    assert str(caught.value) == (
+        "pipelines: own: latency: bootstrap:0:30, and the pipeline says constant:30ms: leave out "
+        "the time of its stage 'tracker'"
+    )
+
+
+def test_a_study_has_a_policy_or_a_pipeline() -> None:
+    with pytest.raises(LaeError, match="policies: the list is empty, and there are no pipelines"):
+        Study.of({"traces": "a.parquet", "policies": []})
 
 
 def test_the_grid_of_sigmas_has_a_name() -> None:

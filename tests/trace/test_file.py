@@ -19,8 +19,9 @@ from witness import BOX, MINIMAL, TRUTH, TYPES, assert_same, columns_of, moving,
 import lae_sim.trace.file
 from lae_sim.decoding import max_decoded
 from lae_sim.errors import LaeError, TraceError
-from lae_sim.trace.file import Trace, read_trace, validate, write_trace
+from lae_sim.trace.file import Trace, read_held, read_trace, validate, write_trace
 from lae_sim.trace.locate import digest
+from lae_sim.trace.locate import opened as opened_there
 from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import STAGES, Recording, batched
 
@@ -610,3 +611,26 @@ def test_metadata_that_would_take_too_much_memory(path: Path) -> None:
     with max_decoded("1MiB"), pytest.raises(TraceError, match=r"trace\.parquet: would take more"):
         read_trace(path)
     assert len(read_trace(path)) == 1
+
+
+def test_a_trace_that_is_held_is_what_is_read_and_opened_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = "traces/synthetic-slow.parquet"
+    opened: list[str] = []
+
+    def counting(name: str) -> Any:
+        opened.append(name)
+        return opened_there(name)
+
+    monkeypatch.setattr(lae_sim.trace.file, "opened", counting)
+    held = read_held(path)
+    assert opened == [path]
+    assert isinstance(held.recordings, list)
+    both = zip(held, read_trace(path), strict=True)
+    assert all(np.array_equal(a.boxes, b.boxes, equal_nan=True) for a, b in both)
+    some = read_held(path, ["boat-calm"])
+    assert [recording.name for recording in some] == ["boat-calm"]
+    large = read_held(path, frames=2_399)
+    assert not isinstance(large.recordings, list)
+    assert large.names == held.names
