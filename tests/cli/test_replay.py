@@ -189,7 +189,7 @@ def test_a_stage_alone_is_faster_and_has_an_initialisation_of_its_own():
     assert 950 < found["tracker_fps"] < 1050
     error = replay(staged, "--latency", "stage:warp,init=2ms", status=2)
     assert "no times of stage 'warp'" in error
-    assert "there are decode, inference" in error
+    assert "it has those of decode, inference" in error
 
 
 def test_vot_realtime_says_that_it_never_scores_latency():
