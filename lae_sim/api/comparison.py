@@ -29,7 +29,7 @@ from lae_sim.files import sequence_names
 from lae_sim.learning.registry import COMPARED, load_any, load_forecaster
 from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.latency import LatencySource
-from lae_sim.replay.names import label_of, named
+from lae_sim.replay.names import named
 from lae_sim.replay.world import SIGMA_GRID, TraceLike, World, open_others
 
 if TYPE_CHECKING:
@@ -250,7 +250,7 @@ def compare_forecasters(
     latency: str | LatencySource | Sequence[str | LatencySource] = "recorded",
     scale: Number | Sequence[Number] = 1,
     fps: Number | None = None,
-    policy: str | Policy = "latest",
+    policy: str | Policy | None = None,
     passes: TraceLike | Sequence[TraceLike] = (),
     search: str = "trace",
     pre_forecaster: str | None = None,
@@ -329,11 +329,11 @@ def compare_forecasters(
         **open_others(None, passes),
     )
     find_convention(convention)
-    if len({(world.fps, label_of(world.policy)) for world in worlds}) > 1:
+    if len({(world.fps, world.policy_label) for world in worlds}) > 1:
         raise LaeError("fps and policy: one of each: compare under others by themselves")
     if not scores_latency(worlds[0].rule()):
-        policy_name = label_of(worlds[0].policy)
-        raise LaeError(f"policy: {policy_name} never scores latency: there is nothing to forecast")
+        named_policy = worlds[0].policy_label
+        raise LaeError(f"policy: {named_policy} never scores latency: there is nothing to forecast")
     rate = worlds[0].fps or next(iter(opened.values())).metadata.fps
     camera = camera_of(root, dataset, wanted, rate, camera_lag)
     ready: dict[str, Any] = {

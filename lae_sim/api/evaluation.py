@@ -238,7 +238,7 @@ def scenarios(
     for place, (label, trace) in enumerate(traces.items()):
         costs: dict[str, int] | None = None
         made: dict[tuple[Fraction, str], AnyFactory] = {}  # once for all worlds of a rate
-        for world in worlds:
+        for world in [each.settled(trace) for each in worlds]:
             find_convention(world.convention)
             rate = trace.metadata.fps if world.fps is None else world.fps
             wanted = list(dict.fromkeys(["hold", *world.forecasters]))
@@ -725,7 +725,7 @@ def evaluate(
     latency: str | LatencySource | Sequence[str | LatencySource] = "recorded",
     scale: Number | Sequence[Number] = 1,
     fps: Number | Sequence[Number] | None = None,
-    policy: str | Policy | Sequence[str | Policy] = "latest",
+    policy: str | Policy | Sequence[str | Policy] | None = None,
     timing: TraceLike | None = None,
     passes: TraceLike | Sequence[TraceLike] = (),
     search: str = "trace",
@@ -756,7 +756,8 @@ def evaluate(
             with the initialisation told apart, ``"constant:47ms,init=800ms"``.
         scale: exact factor on all times: ``1.5`` is 3/2, ``0.1`` is 1/10.
         fps: frames that the world shows per second, such as ``30`` or ``"30000/1001"``.
-        policy: which frame a free tracker takes, such as ``"latest"`` or ``"fifo"``.
+        policy: which frame a free tracker takes, such as ``"latest"`` or ``"fifo"``; by default
+            ``"recorded"`` of a measured log, ``"latest"`` of any other trace.
         timing: another device's trace of the same sequences, to take the times from.
         passes: further traces of the same tracker: at other strides, and gap passes; of several
             traces, each pass goes with those of its tracker and dataset.

@@ -18,6 +18,7 @@ from lae_sim.cli.options import (
     check_outputs,
     exit_status,
     new_parser,
+    policies_of,
     print_json,
 )
 from lae_sim.engine.clock import parse_rational, whole
@@ -152,7 +153,7 @@ def _compare(arguments: argparse.Namespace) -> None:
             "lae_sim": __version__,
             "traces": paths,
             "convention": arguments.convention,
-            "policy": arguments.policy,
+            "policy": policies_of(arguments, result.traces.values()),
             "seed": arguments.seed,
             "method": result.summary.attrs["method"],
             "ranked_by": result.ranking.by,
@@ -169,7 +170,8 @@ def _compare(arguments: argparse.Namespace) -> None:
         return
     for table in reversed(tables.values()):
         print_text(comparison_table(table, screen_width()), end="\n\n")
-    about = f"convention {arguments.convention}, policy {arguments.policy}"
+    policy = policies_of(arguments, result.traces.values())
+    about = f"convention {arguments.convention}, policy {policy}"
     print_text("\n".join([about, *result.notes]))
 
 

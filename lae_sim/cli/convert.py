@@ -228,7 +228,7 @@ def _convert(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json(summary.document(arguments.out))
     else:
-        next_step = f"Next: lae-sim replay {arguments.out}{' --policy recorded' if is_log else ''}"
+        next_step = f"Next: lae-sim replay {arguments.out}"
         print_text("\n".join([*lines_of(summary, arguments.out), next_step]))
 
 

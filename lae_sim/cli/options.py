@@ -22,6 +22,7 @@ from lae_sim.progress import OutputError, print_text, printing, tell
 
 if TYPE_CHECKING:
     from lae_sim.replay.world import World
+    from lae_sim.trace.file import Trace
 
 
 def add_world(parser: argparse.ArgumentParser, sweeps: bool = False) -> None:
@@ -159,7 +160,10 @@ def _world_group(
         action="store_true",
         help="let frames arrive evenly also where the trace says when each of them did",
     )
-    add("--policy", default="latest", help="which frame a free tracker takes (default: latest)")
+    add(
+        "--policy",
+        help="which frame a free tracker takes (default: latest; recorded, of a measured log)",
+    )
     return add
 
 
@@ -422,7 +426,8 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
     from lae_sim.replay.names import parse_latency, parse_policy, several
     from lae_sim.replay.world import World
 
-    parse_policy(arguments.policy)  # what is wrong with an option is said without its Python name
+    for policy in several(arguments.policy):
+        parse_policy(policy)  # what is wrong with an option is said without its Python name
     for latency, scale in product(several(arguments.latency), several(arguments.latency_scale)):
         scaled(parse_latency(latency), scale)
     return World.sweep(
@@ -439,3 +444,11 @@ def worlds_of(arguments: argparse.Namespace, **scores: Any) -> tuple[World, ...]
         forget_arrivals=arguments.forget_arrivals,
         **scores,
     )
+
+
+def policies_of(arguments: argparse.Namespace, traces: Iterable[Trace]) -> str:
+    """The policy by which traces are replayed, or those of the traces, each once."""
+    from lae_sim.replay.world import World
+
+    world = World.of(policy=arguments.policy)
+    return ", ".join(dict.fromkeys(world.settled(trace).policy_label for trace in traces))

@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _train(arguments: argparse.Namespace) -> None:
     from lae_sim import __version__
-    from lae_sim.cli.options import worlds_of
+    from lae_sim.cli.options import policies_of, worlds_of
     from lae_sim.forecast.learned import Learned, write_learned
     from lae_sim.learning.folds import Examples
     from lae_sim.learning.motion import made_up_trace
@@ -109,7 +109,7 @@ def _train(arguments: argparse.Namespace) -> None:
             "traces": paths,
             "latencies": arguments.latency,
             "scales": [str(scale) for scale in arguments.latency_scale],
-            "policy": arguments.policy,
+            "policy": policies_of(arguments, traces),
         }
     made = count(1)
     with ProgressBar("training", "steps") as bar:

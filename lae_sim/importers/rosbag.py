@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from bisect import bisect_left
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
@@ -259,8 +259,9 @@ class _Bag:
                 f"{self._listing()}"
             )
 
-    def _listing(self) -> str:
-        there = [f"{topic} ({kind})" for topic, kind in sorted(self.types.items())]
+    def _listing(self, topics: Iterable[str] = ()) -> str:
+        """Topics with their types: those named, or all that are there."""
+        there = [f"{topic} ({self.types[topic]})" for topic in sorted(topics or self.types)]
         return f"there are {listed(there, 12)}"
 
     def _images(self, asked: str | None) -> str:
@@ -272,7 +273,7 @@ class _Bag:
         if len(found) == 1:
             return found[0]
         few = "no topic of images" if not found else f"{len(found)} topics of images"
-        raise LaeError(f"{self.path}: {few}: name one with --image-topic; {self._listing()}")
+        raise LaeError(f"{self.path}: {few}: name one with --image-topic; {self._listing(found)}")
 
     def _boxes(self, asked: str | None, by_fields: bool) -> str:
         if asked is not None:
@@ -291,7 +292,9 @@ class _Bag:
             return found[0]
         few = "no topic of boxes" if not found else f"{len(found)} topics of boxes"
         more = "" if found else " (and their fields with --field, if they are of another type)"
-        raise LaeError(f"{self.path}: {few}: name one with --box-topic{more}; {self._listing()}")
+        raise LaeError(
+            f"{self.path}: {few}: name one with --box-topic{more}; {self._listing(found)}"
+        )
 
     def _messages(self, topic: str, stamp: str = "header.stamp") -> Iterator[_Message]:
         """The messages of a topic, in the order in which they were received."""

@@ -340,6 +340,8 @@ def _run(
     sampler = Sampler(find_sensors())
     with sampler, ExitStack() as around:
         resting = at_rest(sampler, plan.idle / NS_PER_SECOND)
+        if not resting and plan.idle > ProfilePlan.idle:  # asked for, more than is usual
+            notice("the power at rest is not measured: no sensor of it answers here")
         started = around.enter_context(closing(_start(plan, notice)))
         with suppress(LaeError):  # a tracker may import libraries, or reach the GPU, only now
             warm_up(started, dataset.sequences[0], min(plan.warmup, 1))

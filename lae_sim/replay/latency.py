@@ -76,17 +76,20 @@ class StageTimes:
         """The times of a recording."""
         for name in self.stages:
             if name not in recording.stages:
-                there = ", ".join(in_order(recording.stages)) or "none"
+                there = ", ".join(in_order(recording.stages))
+                stages = f"it has those of {there}" if there else "it has those of whole calls only"
                 raise LaeError(
                     f"sequence {recording.name!r}: the trace has no times of stage {name!r} "
-                    f"(column {stage_column(name)}); of the stages in it there are {there}"
+                    f"(column {stage_column(name)}): {stages}"
                 )
         parts = np.array([recording.stages[name] for name in self.stages])
         ns = np.where((parts < 0).any(0), -1, parts.sum(0))
         absent = f"the trace has no time of {' and '.join(self.stages)} for it"
-        return Times(
-            recording.name, ns, absent=f"{absent}; that of frame 0 may be given, as ,init=TIME"
-        )
+        if len(ns) and ns[0] < 0:
+            absent += "; that of frame 0 may be given, as ,init=TIME"
+        elif len(ns):
+            absent += ": the tracker skipped it, or marked no such stage"
+        return Times(recording.name, ns, absent=absent)
 
 
 def constant(

@@ -12,10 +12,16 @@ from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import listed
 from lae_sim.engine.scheduler import Call, Policy
 from lae_sim.errors import LaeError
+from lae_sim.trace.metadata import Metadata
 from lae_sim.trace.recording import Recording
 
 RECORDED_POLICY = "recorded"
 """Its name, and the ``schedule.policy`` of traces whose schedule follows no rule of ours."""
+
+
+def is_log(metadata: Metadata) -> bool:
+    """Whether a trace was measured under no policy of ours: its schedule can only be repeated."""
+    return metadata.document["schedule"].get("policy") == RECORDED_POLICY
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from lae_sim.errors import LaeError, explained, shown
 from lae_sim.replay.latency import LatencySource, RandomSource, by_frame
 from lae_sim.replay.passes import split_passes
 from lae_sim.replay.pipeline import PipelineTimes
-from lae_sim.replay.recorded import RECORDED_POLICY, AsRecorded
+from lae_sim.replay.recorded import AsRecorded, is_log
 from lae_sim.replay.search import Outcomes, RecordedAnswers, SearchModel, phase_answers
 from lae_sim.replay.strides import followed
 from lae_sim.trace.file import HELD_FRAMES, Trace
@@ -544,8 +544,7 @@ class Runs:
     def notes(self) -> list[str]:
         """Notes on a log's own schedule, and on when frames arrive, if the trace says so."""
         notes = []
-        schedule = self.times.metadata.document["schedule"]
-        if schedule.get("policy") == RECORDED_POLICY and not isinstance(self.policy, AsRecorded):
+        if is_log(self.times.metadata) and not isinstance(self.policy, AsRecorded):
             notes.append(
                 "the times are those of a log, whose own schedule policy 'recorded' repeats"
             )

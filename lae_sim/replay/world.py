@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
 from typing import Any, TypeAlias, TypeVar
@@ -42,6 +42,7 @@ from lae_sim.replay.names import (
 )
 from lae_sim.replay.passes import split_passes
 from lae_sim.replay.pipeline import PipelineTimes, parse_time, read_pipeline, with_plugins
+from lae_sim.replay.recorded import RECORDED_POLICY, is_log
 from lae_sim.replay.run import Runs
 from lae_sim.replay.search import find_search, parse_search
 from lae_sim.trace.describe import AS_A_FRAME, ASSUMED
@@ -81,7 +82,8 @@ class World:
         forget_arrivals: let frames arrive evenly also where a trace says when each of them arrived,
             which is needed for another rate.
         policy: which frame a free tracker takes: a policy, or a name of one (see
-            :func:`.names.parse_policy`).
+            :func:`.names.parse_policy`); None is each trace's own: ``"recorded"`` of a measured
+            log, ``"latest"`` of any other.
         latency: where processing times come from: a source, or a name of one (see
             :func:`.names.parse_latency`).
         scale: exact factor on all times.
@@ -114,7 +116,7 @@ class World:
     """
 
     fps: Fraction | None = None
-    policy: str | Policy | Plugin = "latest"
+    policy: str | Policy | Plugin | None = None
     latency: str | LatencySource | Plugin = "recorded"
     scale: Fraction = Fraction(1)
     timing: TraceLike | None = None
@@ -135,7 +137,7 @@ class World:
                 raise LaeError(f"{name} of a World is a tuple; World.of takes one value too")
         _check_kinds(
             "policy",
-            [self.policy],
+            [] if self.policy is None else [self.policy],
             (str, Plugin, Callable),
             "a name, such as 'latest', or a function",
         )
@@ -209,7 +211,7 @@ class World:
         cls,
         *,
         fps: Number | None = None,
-        policy: str | Policy | Plugin = "latest",
+        policy: str | Policy | Plugin | None = None,
         latency: str | LatencySource | Plugin = "recorded",
         scale: Number = 1,
         timing: TraceLike | None = None,
@@ -254,7 +256,7 @@ class World:
     def sweep(
         cls,
         *,
-        policy: Any = "latest",
+        policy: Any = None,
         pipeline: Any = None,
         fps: Any = None,
         latency: Any = "recorded",
@@ -274,7 +276,7 @@ class World:
         rates = [named("fps", parse_fps, each) for each in several(fps)]
         factors = [named("scale", _factor, each) for each in several(scale)]
         swept: dict[str, list[Any]] = {
-            "policy": _distinct("policy", rules),
+            "policy": [None] if policy is None else _distinct("policy", rules),
             "pipeline": [None] if pipeline is None else _pipelines(several(pipeline)),
             "fps": [None] if fps is None else list(dict.fromkeys(rates)),
             "latency": _distinct("latency", times),
@@ -289,8 +291,22 @@ class World:
         combinations = product(*swept.values())
         return tuple(cls.of(**dict(zip(swept, values)), **others) for values in combinations)
 
+    def settled(self, trace: TraceLike) -> World:
+        """This world with the policy of a trace, which is that of its times, if none is named.
+
+        Raises:
+            LaeError: if a trace is missing or damaged.
+        """
+        if self.policy is not None:
+            return self
+        times = open_trace(trace if self.timing is None else self.timing)
+        is_recorded = self.pipeline is None and is_log(times.metadata)
+        return replace(self, policy=RECORDED_POLICY if is_recorded else "latest")
+
     def rule(self) -> Policy:
-        """The policy itself."""
+        """The policy itself; ``latest`` if none is named."""
+        if self.policy is None:
+            return policies.latest
         if isinstance(self.policy, Plugin):
             return self.policy.made  # type: ignore[no-any-return]
         return parse_policy(self.policy) if isinstance(self.policy, str) else self.policy
@@ -304,7 +320,9 @@ class World:
     @property
     def policy_label(self) -> str:
         """What says which frames are taken: the policy, or ``"pipeline:NAME"``."""
-        return label_of(self.policy) if self.pipeline is None else f"pipeline:{self.pipeline.name}"
+        if self.pipeline is not None:
+            return f"pipeline:{self.pipeline.name}"
+        return "latest" if self.policy is None else label_of(self.policy)
 
     def label(self) -> str:
         """The latency and its scale, such as ``"recorded x 2"``."""
@@ -363,7 +381,7 @@ class World:
             opened,
             Clock.at(opened.metadata.fps if self.fps is None else self.fps),
             scaled(self.source(), self.scale),
-            self.rule(),
+            self.settled(opened).rule(),
             None if self.timing is None else open_trace(self.timing),
             (*(each if names is None else each.chosen(names) for each in strided), *gaps),
             find_search(self.search, opened.metadata, gaps, pre_forecaster, self.keep_size),
@@ -376,7 +394,7 @@ def replay_trace(
     trace: TraceLike,
     *,
     fps: Number | None = None,
-    policy: str | Policy = "latest",
+    policy: str | Policy | None = None,
     latency: str | LatencySource = "recorded",
     scale: Number = 1,
     timing: TraceLike | None = None,

@@ -6,6 +6,7 @@ import math
 import re
 import shutil
 import textwrap
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from lae_sim.trace.describe import SequenceTimes
 
 _WIDTH, _INDENT, _BAR, _STALLS = 96, 13, 50, 10
-_UNNAMED = ("name", "model", "kind", "source")  # whose values say what they are
+_UNNAMED = ("name", "model", "kind", "source", "file")  # whose values say what they are
 _JOULES = Number(".3g")
 _MEASURED = ("readings", "energy", "clocks", "slowdowns", "unread", "beside")  # told apart
 _FIGURES: dict[str, Callable[[Any], float]] = {
@@ -59,7 +60,7 @@ def overview(report: Mapping[str, Any]) -> str:
 
 
 def _entry(label: str, value: Any) -> str:
-    label = _words(label.replace("_", " "))[: _INDENT - 1].ljust(_INDENT)
+    label = f"{_words(label.replace('_', ' ')):.40} ".ljust(_INDENT)
     width = max(60, min(_WIDTH, shutil.get_terminal_size((_WIDTH, 24)).columns))
     words = textwrap.shorten(_words(value), 1000)
     return textwrap.fill(words, width, initial_indent=label, subsequent_indent=" " * _INDENT)
@@ -69,15 +70,28 @@ def _section(label: str, section: Any) -> list[str]:
     """A value of the metadata; the objects in it on lines of their own."""
     if not isinstance(section, dict):
         return [_entry(label, section)]
+    section = dict(_told(key, value) for key, value in section.items())
     inner = {key: value for key, value in section.items() if value and _has_keys(value)}
     lines = [_entry(label, {key: value for key, value in section.items() if key not in inner})]
-    return lines + [_entry(f"  {key}", inner[key]) for key in inner]
+    lines += [_entry(f"  {key}", inner[key]) for key in inner]
+    return [line for line in lines if line]  # an empty object has none
 
 
 def _has_keys(value: Any) -> bool:
     """Whether it is an object, or a list of such."""
     items = value if isinstance(value, list) else [value]
     return all(isinstance(item, dict) for item in items)
+
+
+def _told(key: str, value: Any) -> tuple[str, Any]:
+    """A key and its value as people read them: times in ms rather than ns."""
+    if not key.endswith("_ns"):
+        return key, value
+    if isinstance(value, dict):
+        return key[:-3], {name: _told(f"{name}_ns", each)[1] for name, each in value.items()}
+    if isinstance(value, int) and abs(value) < 2**63:
+        return key[:-3], f"{value / 1e6:.12g} ms"
+    return key, value
 
 
 def _words(value: Any, depth: int = 0) -> str:
@@ -88,7 +102,8 @@ def _words(value: Any, depth: int = 0) -> str:
         keys = sorted(value, key=lambda key: key not in _UNNAMED)
         return ", ".join(_item(k, value[k], depth) for k in keys if value[k] is not None)
     if isinstance(value, list):
-        return "; ".join(_words(item, depth + 1) for item in value)
+        found = Counter(_words(item, depth + 1) for item in value)
+        return "; ".join(text if n == 1 else f"{n} x {text}" for text, n in found.items())
     if isinstance(value, float):
         return f"{value:.6g}"
     return visible(re.sub(r"\b([0-9a-f]{12})[0-9a-f]{8,}\b", r"\1...", str(value)[:300]))

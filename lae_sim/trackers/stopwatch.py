@@ -164,6 +164,8 @@ def _checked(output: Any) -> tuple[list[float] | None, float | None]:
         numbers = box if isinstance(box, (list, tuple)) else ()
         if len(numbers) != 4 or not all(_is_number(v) and abs(v) <= LARGEST for v in numbers):
             wrong = f"answered {shown(output)}, not a box of four finite numbers"
+            if len(numbers) > 1 and all(isinstance(row, (list, tuple)) for row in numbers):
+                wrong += "; lae_sim.trackers.box_of makes one of a mask"
             if isinstance(box, bool):
                 wrong += "; of OpenCV's (found, box) answer the box, or None if it is not found"
             raise LaeError(wrong)

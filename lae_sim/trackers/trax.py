@@ -106,7 +106,9 @@ def _read(path: str) -> configparser.ConfigParser:
         with open(path, encoding="utf-8-sig") as file:
             registry.read_file(file, path)
     except FileNotFoundError as error:
-        raise LaeError(f"{path}: no such file: ini is a registry of the VOT toolkit") from error
+        raise LaeError(
+            f"{path}: no such file: name a registry of the VOT toolkit (option ini)"
+        ) from error
     except OSError as error:
         raise LaeError(f"{path}: {error.strerror}") from error
     except (configparser.Error, ValueError) as error:

@@ -94,7 +94,7 @@ SETTINGS: list[tuple[dict[str, Any], str]] = [
     ({"fps": "thirty"}, f"fps: 'thirty' {NOT_EXACT}"),
     ({"policy": "lastest"}, "policy: no policy 'lastest': .*; did you mean 'latest'?"),
     ({"policy": 3}, "policy: 3 is not a name"),
-    ({"policy": None}, "policy: name at least one"),
+    ({"policy": []}, "policy: name at least one"),
     ({"policy": "every:0"}, "policy: 'every:0' needs a whole number from 1"),
     ({"policy": lambda: 1}, "policy or latency: TypeError"),
     ({"timing": "missing.parquet"}, "timing: missing.parquet: no such file"),
@@ -315,7 +315,7 @@ def test_profiles(
     ("fields", "message"),
     [
         ({"policy": 3}, "policy: 3 is not a name"),
-        ({"policy": None}, "policy: None is not a name"),
+        ({"policy": ["latest"]}, "policy: ['latest'] is not a name"),
         ({"latency": 47}, "latency: 47 is not a name"),
         ({"scale": 1.5}, "exact; World.of takes text too"),
         ({"scale": True}, "exact; World.of takes text too"),

@@ -470,7 +470,7 @@ LOG = """frame,arrived_ms,ready_ms,x,y,w,h
 """
 
 
-def test_a_log_replays_by_the_policy_that_is_named_last(tmp_path, capsys):
+def test_a_log_replays_as_it_ran(tmp_path, capsys):
     (tmp_path / "flight.csv").write_text(LOG)
     trace = tmp_path / "t.parquet"
     assert main([str(tmp_path / "flight.csv"), "--fps", "30", "--out", str(trace)]) == 0
@@ -480,13 +480,13 @@ def test_a_log_replays_by_the_policy_that_is_named_last(tmp_path, capsys):
         "median 34.2 ms a frame. Read as csv; times: measured.\n"
         "Note: the first output's time stands for that of the initialisation.\n"
         "Note: no ground truth: a replay tells of ages and skipped frames, not of scores.\n"
-        f"Next: lae-sim replay {trace} --policy recorded\n"
+        f"Next: lae-sim replay {trace}\n"
     )
-    assert replay_main([str(trace), "--policy", "recorded", "--json"]) == 0
+    assert replay_main([str(trace), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["traces"][0]["policy"] == "recorded"
     assert found["traces"][0]["exact"]
-    assert replay_main([str(trace)]) == 2
+    assert replay_main([str(trace), "--policy", "latest"]) == 2
     assert "or the policy that it was recorded under" in capsys.readouterr().err
     assert main([str(tmp_path / "flight.csv"), "--json", "--out", str(trace)]) == 0
     summary = json.loads(capsys.readouterr().out)

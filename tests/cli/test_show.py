@@ -326,6 +326,20 @@ def test_odd_figures_are_shown() -> None:
     assert "cpu        A; 2" in text
 
 
+def test_a_log_and_its_models_are_told_in_words() -> None:
+    log = {"clock_offset_ns": -12_505_008_241, "camera_delay_ns": {"least": 5_017_473, "most": 8e6}}
+    model = {"digest": "sha256:50be", "file": "backbone.onnx", "threads": 1}
+    head = {**model, "file": "head.onnx"}
+    document = {"log": log, "tracker": {"models": [model, head, model]}, "device": {}}
+    metadata = Metadata.new("30", "every-frame", **document)
+    text = overview(describe(Trace(metadata, profiled()[1]), "trace")[0])
+    assert "\n\n" not in text.partition("\n\ntimes")[0].partition("\n\n")[2]
+    assert "\nlog          clock offset -12505.008241 ms\n" in text
+    assert "\n  camera delay least 5.017473 ms, most 8e+06\n" in text
+    models = "2 x backbone.onnx, digest sha256:50be, threads 1; head.onnx, digest"
+    assert models in " ".join(text.split())
+
+
 _NUMBERS = st.dictionaries(TEXT, st.floats(allow_nan=False, allow_infinity=False))
 _ENERGY = {
     "calls": st.integers(),

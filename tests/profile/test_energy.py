@@ -164,7 +164,7 @@ def test_a_sensor_that_fails_midway_says_so_and_ends_nothing(
     tmp_path: Path, root: Path, device: Device
 ) -> None:
     def fail(done: int, total: int) -> None:
-        if done >= LENGTH:
+        if done > LENGTH:  # the first sequence is over, and read to its end
             device.watts = None
 
     (trace,), said = profiled(root, tmp_path / "t.parquet", {}, progress=fail)
@@ -182,10 +182,12 @@ def test_without_sensors_there_is_nothing(
     tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "find_sensors", tuple)
-    (trace,), _ = profiled(root, tmp_path / "t.parquet", {"idle": "600s"})
+    (trace,), said = profiled(root, tmp_path / "t.parquet", {"idle": "600s"})
+    assert said == "the power at rest is not measured: no sensor of it answers here"
     assert not {"energy", "clocks", "slowdowns", "unread"} & set(trace.metadata.document["device"])
     assert "sampled" not in trace.metadata.document["sequences"]["a"]
     assert "power" not in overview(describe(trace, "t.parquet")[0])
+    assert profiled(root, tmp_path / "usual.parquet", {"idle": "2s"})[1] == ""
 
 
 def test_means_over_sequences_count_by_their_time() -> None:

@@ -148,8 +148,9 @@ def test_answers_are_the_same_from_a_process(start: Any, answer: str) -> None:
     else:
         before = pid(worker)
         wrong = "not a box of four finite numbers|100000.*no float32|RuntimeError: no number"
-        with pytest.raises(TrackerError, match=wrong):
+        with pytest.raises(TrackerError, match=wrong) as raised:
             worker.track(FRAME)
+        assert ("box_of makes one of a mask" in str(raised.value)) == (answer == "frame")
         assert pid(worker) == before
 
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from witness import moving
 
+from lae_sim.api.evaluation import evaluate
 from lae_sim.engine.clock import Clock
 from lae_sim.engine.policies import every, fifo, latest
 from lae_sim.engine.scheduler import Policy, simulate
@@ -59,6 +60,23 @@ def test_sequences_of_a_trace_have_rules_of_their_own() -> None:
     assert Runs(trace, CLOCK).notes() == [
         "the times are those of a log, whose own schedule policy 'recorded' repeats"
     ]
+
+
+def test_a_log_is_replayed_as_recorded_unless_a_policy_is_named() -> None:
+    log = run_in_real_time(every(4))
+    trace = Trace(Metadata.new("30", "real-time", schedule={"policy": "recorded"}), [log])
+    every_frame = Trace(Metadata.new("30", "every-frame"), [moving(40, 9, "s")])
+    [run] = World().replay(trace)
+    assert run.schedule.frames.tolist()[:4] == [0, 4, 8, 12]
+    assert World().settled(trace).policy_label == "recorded"
+    assert World(timing=trace).settled(every_frame).policy_label == "recorded"
+    assert World(timing=every_frame).settled(trace).policy_label == "latest"
+    assert World().settled(every_frame).policy_label == World().policy_label == "latest"
+    assert World.of(policy="fifo").settled(trace).policy_label == "fifo"
+    with pytest.raises(LaeError, match="the policy that it was recorded under"):
+        list(World.of(policy="latest").replay(trace))
+    result = evaluate({"log": trace, "full": every_frame}, forecasters="hold")
+    assert result.summary["policy"].tolist() == ["recorded", "latest"]
 
 
 def test_frames_queue_where_times_are_longer() -> None:
