@@ -21,7 +21,7 @@ RECORDED_POLICY = "recorded"
 
 def is_log(metadata: Metadata) -> bool:
     """Whether a trace was measured under no policy of ours: its schedule can only be repeated."""
-    return metadata.document["schedule"].get("policy") == RECORDED_POLICY
+    return bool(metadata.document["schedule"].get("policy") == RECORDED_POLICY)
 
 
 @dataclass(frozen=True)
