@@ -109,21 +109,26 @@ def test_a_file_system_that_cannot_be_used_is_one_line(monkeypatch: pytest.Monke
         read_trace("far://x")
 
 
-def test_a_file_without_permission_is_one_line(memory: Any, monkeypatch: Any) -> None:
+def test_a_file_without_permission_is_one_line(
+    memory: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise PermissionError("Forbidden\nby the bucket")
 
-    monkeypatch.setattr(type(memory), "open", refuse)
-    monkeypatch.setattr(type(memory), "info", refuse)
-    monkeypatch.setattr(os, "listdir", refuse)
-    for function, path in (
-        (find_traces, ["memory://lae"]),
-        (find_traces, [os.curdir]),
-        (digest, "memory://lae/a.parquet"),
-        (read_trace, "memory://lae/a.parquet"),
-    ):
-        with pytest.raises(LaeError, match=r"read \(PermissionError: Forbidden by the bucket\)$"):
-            function(path)  # type: ignore[operator]
+    with monkeypatch.context() as each:  # undone before the files are taken away
+        each.setattr(type(memory), "open", refuse)
+        each.setattr(type(memory), "info", refuse)
+        each.setattr(os, "listdir", refuse)
+        for function, path in (
+            (find_traces, ["memory://lae"]),
+            (find_traces, [os.curdir]),
+            (digest, "memory://lae/a.parquet"),
+            (read_trace, "memory://lae/a.parquet"),
+        ):
+            with pytest.raises(
+                LaeError, match=r"read \(PermissionError: Forbidden by the bucket\)$"
+            ):
+                function(path)  # type: ignore[operator]
 
 
 def test_a_url_without_fsspec_tells_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
