@@ -13,20 +13,15 @@ from typing import Any
 from lae_sim import __version__
 from lae_sim.engine.clock import whole
 from lae_sim.errors import LaeError, shown
-from lae_sim.figures.column import drawn
-from lae_sim.figures.study import study_in_columns
 from lae_sim.files import text_digest, written_whole
 from lae_sim.plugins import looking_in
 from lae_sim.progress import ProgressBar, ShowProgress
 from lae_sim.replay.names import named
-from lae_sim.report.page import page_drawings, page_of, page_sections
 from lae_sim.report.paper import Paper, Records, remove_paper, write_paper, written_before
-from lae_sim.report.study_tables import paper_tables
 from lae_sim.study.executors import RunAll, run_here
 from lae_sim.study.run import StudyResults, check_inputs, compute_study
 from lae_sim.study.spec import Study, read_study
 from lae_sim.study.store import Store
-from lae_sim.study.view import View
 from lae_sim.trace.locate import digest
 
 VIEWS = "views"
@@ -139,6 +134,13 @@ def write_views(
         return
     if root is None and _are_there(results):
         return
+    # imported where something is drawn: a study that goes on often has all of it already
+    from lae_sim.figures.column import drawn
+    from lae_sim.figures.study import study_in_columns
+    from lae_sim.report.page import page_drawings, page_of, page_sections
+    from lae_sim.report.study_tables import paper_tables
+    from lae_sim.study.view import View
+
     view = View(results)
     sections, figures = page_sections(view, root), [*study_in_columns(view)]
     pictures = page_drawings(sections)
