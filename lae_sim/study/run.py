@@ -137,12 +137,6 @@ class StudyResults:
 
         return pd.DataFrame(flat_rows(self.summary))
 
-    def scores_frame(self) -> DataFrame:
-        """The summary with all numbers as numbers: the table of :meth:`score_rows`."""
-        import pandas as pd
-
-        return pd.DataFrame(self.score_rows(), columns=self.score_names())
-
     def score_names(self) -> list[str]:
         """The columns of :meth:`score_rows`."""
         flat = (record.flat() for record in self.summary)
