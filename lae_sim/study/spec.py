@@ -248,12 +248,13 @@ def _pipelines(value: Any) -> tuple[Pipeline, ...]:
 
 
 def _pipeline(value: Any, name: str | None = None) -> Pipeline:
-    if isinstance(value, Mapping):
-        value = parse_pipeline(value, name or "pipeline")
-    elif not isinstance(value, Pipeline):
-        value = read_pipeline(value)
-    named_so = value if name is None else replace(value, name=name)
-    return parse_pipeline(pipeline_document(named_so))  # which refuses what has no name
+    if isinstance(value, Pipeline):
+        made = parse_pipeline(pipeline_document(value))  # which refuses what has no name
+    elif isinstance(value, Mapping):
+        made = parse_pipeline(value, name or "pipeline")
+    else:
+        made = read_pipeline(value)
+    return made if name is None else replace(made, name=name)
 
 
 def _policies(value: Any) -> tuple[str, ...]:
